@@ -679,7 +679,7 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     def always(value):
         return Trajectory(mesh, np.broadcast_to(value, (*mesh.points.shape, *np.shape(value))))
 
-    dynamics = Dynamics(always(np.diag([0.1, -1.0])), always(np.zeros(2)), 0.0)
+    dynamics = Dynamics(always(np.diag([0.1, -1.0])), always(np.zeros(2)), 0.0, np.ones(2))
     least = (1.0 + np.log(100.0)) / 160.0
     gains = share * least * np.array([[1.0], [5.0]])
     found = follow(always(2.0 * np.eye(2, 3)), dynamics, np.zeros(2), gains, T).requirement
@@ -689,7 +689,11 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
     extended = np.tile(np.eye(2, 3), (2, 3, 1, 1))
     extended[:, -1, :, :2] = ends
-    assert solved(extended).requirement.holds == holds
+    assert solved(extended, np.ones(2)).requirement.holds == holds
+    # Units do not matter.
+    unit = np.array([1e-9, 1e4])
+    extended[..., :2] /= unit * unit[:, None]
+    assert solved(extended, unit).requirement.holds == holds
 
 
 # A plain field as an axis -----------------------------------------------------------------------

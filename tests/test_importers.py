@@ -200,10 +200,12 @@ def test_names_that_are_there_twice():
 
 def test_a_switch_at_given_instants():
     text = "switch\nV1 a 0 1\nS1 a b on=1 off=3 ron=1 roff=1meg\nC1 b 0 1 ic=0\nR1 b 0 1g\n"
-    result = simulated(plant_of(text, measure="v(b)"), 5.0)
-    t, v = result["t"], result["y_b"]
+    result = simulated(plant_of(text, measure="v(b),i(S1)"), 5.0)
+    t, v, i = result["t"], result["y_b"], result["y_is1"]
     assert np.abs(v[t < 1]).max() < 2e-6
     closed = (t > 1) & (t < 3)
+    np.testing.assert_allclose(i[closed], np.exp(-(t[closed] - 1)), atol=2e-6)
+    np.testing.assert_allclose(i[(t < 1) | (t > 3)], 0.0, atol=2e-6)
     np.testing.assert_allclose(v[closed], 1 - np.exp(-(t[closed] - 1)), atol=2e-6)
     np.testing.assert_allclose(v[t > 3], 1 - np.exp(-2.0), atol=2e-6)
 

@@ -248,13 +248,13 @@ def test_what_decays_and_comes_back_is_resolved_or_refused(rate):
 
 def test_coefficients_that_swing_are_resolved_before_anything_is_solved(monkeypatch):
     """Elements are solved on one mesh, and as well as they are by other elements."""
-    solved, march = [], series._marched
+    solved, terms = [], series._terms
 
-    def counted(*arguments):
-        solved.append(arguments[4].size)
-        return march(*arguments)
+    def counted(A, f, mesh, *others):
+        solved.append(mesh.size)
+        return terms(A, f, mesh, *others)
 
-    monkeypatch.setattr(series, "_marched", counted)
+    monkeypatch.setattr(series, "_terms", counted)
     system, time = plant(ladder, varying=True, swing=200), TimeSettings(horizon=2.0)
     found = large.large_simulation(system, time, SolverSettings(tol=1e-9))
     assert len(solved) == 1

@@ -114,8 +114,8 @@ def test_singular_values_that_are_small_everywhere_are_followed_to_the_bottom(bo
     def values(t):
         return np.stack([np.ones_like(t), bottom + 1e-7 * np.abs(t - 0.3712), np.ones_like(t)], -1)
 
-    def lines(t, _, column, which):
-        return values(t).reshape(-1, structure._DIP_POINTS, 3)[which, :, column]
+    def lines(t, _, column):
+        return values(t).reshape(-1, structure._DIP_POINTS, 3)[range(len(column)), :, column]
 
     t = np.linspace(0.0, 1.0, 65)
     arguments = plant(states=["a"], E=[[1]], A=[["sin(t)"]], initial_state=[1]), t, values(t)

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from plants import CONF
 from random_systems import HORIZON, random_system
-from units import drawn, in_units
+from units import Units, drawn, in_units
 
 from gpebo_cli import estimators, run
 from gpebo_cli.evidence.excitation import WELL
@@ -26,21 +26,27 @@ FROM_ZERO = ("motor", "published/akzo", "published/hires", "published/robertson"
 EPS = float(np.finfo(float).eps)
 
 
-def both(name, decades, kept=(), **settings):
-    """Details of a run of a plant, of one in other units but for those kept, and the units."""
+def both(name, decades, kept=(), seed=5, **settings):
+    """Details of a run of a plant, of one in other units but for those kept, and the units.
+
+    Settings that have units are functions of them.
+    """
     if isinstance(name, int):
         content, horizon = random_system(name)[0], HORIZON
     else:
         content = yaml.safe_load((CONF / "plant" / f"{name}.yaml").read_text(encoding="utf-8"))
         content = {key: content[key] for key in content if key not in ("units", "labels")}
         horizon = SHORT.get(name, 10.0)
-    units = drawn(np.random.default_rng(5), plant_from_mapping(content), decades=decades)
+    units = drawn(np.random.default_rng(seed), plant_from_mapping(content), decades=decades)
     units = units._replace(**{kind: np.ones_like(getattr(units, kind)) for kind in kept})
     units = units._replace(time=float(units.time))
 
     one, other = (
-        run(made, time={"horizon": horizon * unit, "samples": 101}, **settings).details
-        for made, unit in ((content, 1.0), (in_units(content, units), units.time))
+        run(made, time={"horizon": horizon * float(by.time), "samples": 101}, **{
+            key: value(by) if callable(value) else value for key, value in settings.items()
+        }).details
+        for made, by in ((content, Units(*map(np.ones_like, units))),
+                         (in_units(content, units), units))
     )
     return one, other, units
 
@@ -104,15 +110,52 @@ def test_evidence_is_the_same_in_any_units(name, decades):
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
 
 
-@pytest.mark.parametrize("name", ["boost", "circuit", "published/ascher_petzold", 5])
-def test_output_injection_is_the_same_in_any_units(name):
-    """Deviations that are small in their unit are not rounding."""
+UNDER = {
+    "reset": ["boost", "circuit", "published/gear_petzold", 8],
+    "current_coordinates": ["boost", "canonical", "circuit", "descriptor", "published/gear_petzold",
+                            "strangeness_free", 0, 5],
+    "output_injection": ["boost", "circuit", "published/ascher_petzold", "published/gear_petzold",
+                         5],
+}
+
+
+@pytest.mark.parametrize(("remedy", "name"), [(r, name) for r in UNDER for name in UNDER[r]])
+def test_remedies_are_the_same_in_any_units(remedy, name):
+    """What is small in its unit only is no rounding, and what is large there is not all there is.
+
+    What is known is in both cases, and from the middle of the horizon on it is the same.
+    """
     one, other, units = both(
-        name, True, estimator={"name": "least_squares", "f0": 1e-200},
-        observer={"name": "gpebo", "remedy": "output_injection"},
+        name, True, seed=[5, 1], estimator={"name": "least_squares", "f0": 1e-200},
+        observer={"name": "gpebo", "remedy": remedy},
     )
-    a, b = one.estimation.states[0, -1], other.estimation.states[0, -1] / units.states
-    assert a == pytest.approx(b, rel=1e-7, abs=1e-7 * np.abs(a).max())
+    known = {name for name, since in one.estimable.items() if since is not None}
+    assert known == {name for name, since in other.estimable.items() if since is not None}
+    assert one.excitation.is_ie == other.excitation.is_ie
+    assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+    size = np.abs(one.simulation.states).max(axis=0)
+    size = np.where(size > 0.0, size, size.max())
+    told = [k for k, state in enumerate(one.system.states) if state in known]
+    a, b = (run.estimation.states[0, 50:, told] for run in (one, other))
+    away = np.abs(b / units.states[told, None] - a) / size[told, None]
+    assert away.max(initial=0.0) <= 1e-8
+
+
+@pytest.mark.parametrize(("name", "states"), [
+    ("window", ["x1", "x2"]), (1, ["x0", "x1"]),
+])
+def test_a_kalman_filter_is_the_same_in_any_units(name, states):
+    """Variances have units, and so has what regularises: a variance times a sample time."""
+    def observer(by):
+        size = dict(zip([*(f"w_{state}" for state in states), "k0", "k1"],
+                        [*by.states[: len(states)], *by.unknowns], strict=False))
+        return {"name": "kalman_bucy", "regularisation": 1e-3 * float(by.time) ** 0.5,
+                "P0": {each: 10.0 * float(unit) ** 2 for each, unit in size.items()}}
+
+    one, other, units = both(name, True, seed=[5, 1], observer=observer)
+    assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+    a, b = (run.estimation.states[0] for run in (one, other))
+    assert (np.abs(b / units.states - a) <= 1e-10 * np.abs(a).max(axis=0)).all()
 
 
 @pytest.mark.parametrize("seed", [102, 123])

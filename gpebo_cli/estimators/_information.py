@@ -21,10 +21,10 @@ from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._scalar import SINGULAR, low_pass
 from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest, transpose
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
+from gpebo_cli.regression.resets import ExtensionState, level_of
 
 _PICARD_ROUNDS = 200
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
@@ -39,7 +39,7 @@ class Information:
 
     gram: Trajectory  # [G_z | h_z], shape (p, p + c)
     memory: Trajectory  # z, scalar
-    level: float  # ‖∫ψᵀψ‖ over this regression alone, or more
+    level: Array  # (p,) diagonal of ∫ψᵀψ over this regression alone, or more
 
     @property
     def reached(self) -> ExtensionState:
@@ -153,9 +153,9 @@ def information(
     With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and f₀ do not
     matter.
     """
-    level, before = largest(regression.gram.final), 1.0
+    level, before = level_of(regression.gram.final), 1.0
     if known is not None:
-        level, before = max(level, known.level), known.memory
+        level, before = np.maximum(level, known.level), known.memory
     if beta == 0.0:
         gram = regression.gram
         if known is not None:
@@ -176,7 +176,7 @@ def information(
 
 def _bounded(
     regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float,
-    known: ExtensionState | None, level: float,
+    known: ExtensionState | None, level: Array,
 ) -> Information:
     """Forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
 

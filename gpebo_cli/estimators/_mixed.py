@@ -14,12 +14,12 @@ from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, largest, transpose
+from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Lasting, SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState, Known
+from gpebo_cli.regression.resets import ExtensionState, Known, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
 
@@ -99,9 +99,9 @@ class FilteredEstimator(ResumableEstimator):
         """Filtered [ψᵀψ | ψᵀY] (p, p + c), with the ``rates`` (p,), from ``start`` or 0."""
         return kreisselmeier(regression, rates, start)
 
-    def size(self, regression: LinearRegression) -> float:
-        """What no filter exceeds."""
-        return largest(regression.outer.values)
+    def size(self, regression: LinearRegression) -> Array:
+        """What no filter's diagonal (p,) exceeds."""
+        return level_of(regression.outer.values)
 
 
 def scalar_errors(
@@ -117,9 +117,9 @@ def scalar_errors(
     return filtered_errors(filters, into, law, weighted * adjugate)
 
 
-def reached(size: float, extended: Trajectory, known: Known) -> ExtensionState:
+def reached(size: Array, extended: Trajectory, known: Known) -> ExtensionState:
     """[Ω | 𝒴] (p, p + 1) at the end, of filters whose input is of that ``size``."""
-    level = max(size, known[0].level) if known else size
+    level = np.maximum(size, known[0].level) if known else size
     return ExtensionState(extended.final, level, surplus=1.0)
 
 
@@ -191,6 +191,7 @@ class MixedEstimates(Lasting):
     mu: float | None = None  # of finite time: w_c = min(e^{−γ∫Δ²}, 1 − μ) of the start is taken out
     realisations: tuple[int, ...] = ()
     known: Known = ()  # of each group at the start
+    units: Array | float = 1.0  # (p,) in which parameters are comparable
 
     @cached_property
     def reached(self) -> tuple[ExtensionState, ...]:
@@ -228,7 +229,9 @@ class MixedEstimates(Lasting):
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) from ``start`` (P,) or (g, P) with ``gains`` (g, P or 1)."""
-        return scalar_law(path, start, gains)
+        each = np.broadcast_to(self.units, len(self.start))
+        units = np.repeat(each, path.quotient.shape[-1] // len(each))
+        return units * scalar_law(path.comparable(units), start / units, gains)
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
@@ -272,5 +275,5 @@ def mixed_estimates(
     names = regression.parameters
     return MixedEstimates(
         groups, settings.start(names), settings.gains("gamma", names), condition, at_end,
-        realisations=regression.realisations, known=known,
+        realisations=regression.realisations, known=known, units=regression.units,
     )

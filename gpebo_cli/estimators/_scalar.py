@@ -11,7 +11,7 @@ collocation as everything else, all gains as one batch.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -98,11 +98,21 @@ class ScalarPath:
     energy: Array  # (K, s + 1) I
     t: Array  # (M,)
     energy_at_t: Array  # (M,)
-    floor: float  # size below which η̂ is rounding
+    floor: float  # size below which comparable η̂ is rounding
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (N,)."""
         return self.signals(t, t)[0]
+
+    def comparable(self, units: Array) -> ScalarPath:
+        """The same of parameters in units (p,), in which they are comparable."""
+        def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
+            delta, Y, digits = self.signals(t, inside)
+            return delta, Y / units, digits
+
+        if (units == 1.0).all():
+            return self
+        return replace(self, signals=signals, quotient=self.quotient / units)
 
 
 class _UnresolvedError(Exception):

@@ -34,7 +34,7 @@ class VectorLaw:
     M: Trajectory | None  # None: the identity
     N: Trajectory
     b: Trajectory
-    floor: float = 0.0  # size below which η̂ is rounding
+    floor: Array | float = 0.0  # (p,) size below which η̂ is rounding
     dynamics: Dynamics | None = None  # η̂' = 𝔸η̂ + 𝕓 + Γ Mᵀ (b − N η̂) for parameters that move
 
     def solve(self, gains: Array, start: Array) -> Trajectory:
@@ -52,7 +52,10 @@ class VectorLaw:
         b = with_realisations(self.N.values, self.b.values)
         signals = [self.N.values, b] if self.M is None else [self.M.values, self.N.values, b]
         first, eta, found = 0, start, list[Trajectory]()
-        sizes: float | Array = self.floor  # so far: later, η̂ and ν may have decayed
+        # So far: later, η̂ and ν may have decayed.
+        sizes = np.broadcast_to(self.floor, len(start))[:, None]
+        if self.M is not None:
+            sizes = np.concatenate([sizes, np.abs(self.N.values).max(axis=(0, 1)) @ sizes])
         for window in self.N.mesh.windows():
             part = slice(first, first + window.size)
             packed = np.concatenate([values[part] for values in signals], axis=-1)
@@ -63,7 +66,7 @@ class VectorLaw:
         return joined(found)
 
     def _over(
-        self, packed: Trajectory, gains: Array, start: Array, sizes: float | Array
+        self, packed: Trajectory, gains: Array, start: Array, sizes: Array
     ) -> Trajectory:
         """(η̂, ν) for [M | N | b] over a window, from η̂ (p,) or (p, c); rounding is below sizes."""
         p, residual = len(start), self.M is not None

@@ -41,7 +41,8 @@ class Gradient(ResumableEstimator):
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> VectorEstimates:  # noqa: ARG002
         """Prepare the law for the times t (M,); a case is integrated when it is asked for."""
         information = Trajectory(regression.mesh, regression.outer.values[..., : regression.p])
-        law = VectorLaw(regression.psi, regression.psi, regression.Y, regression.floor)
+        floor = regression.floor * regression.units
+        law = VectorLaw(regression.psi, regression.psi, regression.Y, floor)
         return vector_estimates(self, regression, law, information, t)
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:  # noqa: ARG002

@@ -9,7 +9,7 @@ from itertools import repeat
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, SolverError
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
 from gpebo_cli.estimators._information import (
     CLEAR,
@@ -137,7 +137,7 @@ class LeastSquares(ResumableEstimator):
                 case["f0"] * prior,
             )(t)
             for case in self.cases
-        ]))
+        ]), dynamics.units)
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).
@@ -153,18 +153,21 @@ class LeastSquares(ResumableEstimator):
         )
 
 
-def solved(extended: Array) -> Found:
-    """η̂ = F 𝒴 from [F⁻¹ | 𝒴] of every case (cases, M, p, p + 1) (SolverError: F⁻¹ is singular)."""
-    sigma = np.linalg.svd(extended[:, -1, :, :-1], compute_uv=False)
-    worst = float((sigma[:, -1] / sigma[:, 0]).min())
-    try:
-        eta = np.linalg.solve(extended[..., :-1], extended[..., -1:])[..., 0]
-    except np.linalg.LinAlgError as error:
-        raise SolverError(
-            "observer.remedy=current_coordinates: F⁻¹ is singular, because "
-            "A_0 has directions that decay too fast; use output_injection or reset"
-        ) from error
-    return Found(np.asarray(eta, dtype=np.float64), Requirement(
+def solved(extended: Array, units: Array) -> Found:
+    """η̂ = F 𝒴 from [F⁻¹ | 𝒴] of every case (cases, M, p, p + 1), where that is more than rounding.
+
+    It is solved in units of each parameter's own size; directions of rounding are left at zero.
+    Whether it is regular at the end is judged in ``units`` (p,) in which they are comparable.
+    """
+    square = np.einsum("cmii->cmi", extended[..., :-1])
+    size = np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
+    eigenvalues, V = np.linalg.eigh(extended[..., :-1] / size / transpose(size))
+    told = eigenvalues > _DIGITS * eigenvalues[..., -1:]
+    share = np.where(told, 1.0 / np.where(told, eigenvalues, 1.0), 0.0)[..., None]
+    eta = V @ (share * (transpose(V) @ (extended[..., -1:] / size))) / size
+    final = np.linalg.svd(extended[:, -1, :, :-1] * units * units[:, None], compute_uv=False)
+    worst = float((final[:, -1] / final[:, 0]).min())
+    return Found(np.asarray(eta[..., 0]), Requirement(
         name="F⁻¹ regular", holds=worst >= _DIGITS,
         evidence={"reciprocal_condition": worst, "needed": _DIGITS},
         text=f"σ_min/σ_max of F⁻¹ is {worst:.2g} at the end; needed is {_DIGITS:.0e}",

@@ -10,7 +10,6 @@ from gpebo_cli.estimators._mixed import FilteredEstimator
 from gpebo_cli.estimators._recursive import KreisselmeierFilter
 from gpebo_cli.estimators._scalar import lion
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
@@ -36,9 +35,9 @@ class Lion(FilteredEstimator):
         """The filters, with rates of shape (p,), where no row is known before its sample."""
         return _RowFilter(rates)
 
-    def size(self, regression: LinearRegression) -> float:
-        """The size of p rows of ψ, which no filter exceeds."""
-        return float(np.sqrt(regression.p * largest(regression.outer.values)))
+    def size(self, regression: LinearRegression) -> Array:
+        """The sizes (p,) of columns of p rows of ψ, which no filter exceeds."""
+        return np.asarray(np.sqrt(regression.p * super().size(regression)))
 
 
 class _RowFilter(KreisselmeierFilter):

@@ -24,13 +24,13 @@ from gpebo_cli.estimators._vector import (
 )
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import largest, transpose
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import Known
+from gpebo_cli.regression.resets import Known, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number
 
@@ -54,7 +54,7 @@ class MemoryExtension(ResumableEstimator):
         extended = kreisselmeier(
             regression, self._rates(regression.p), known[0].values if known else None
         )
-        state = reached(largest(regression.outer.values), extended, known)
+        state = reached(level_of(regression.outer.values), extended, known)
         return replace(self._estimates(regression, extended, t), reached=(state,))
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
@@ -93,7 +93,7 @@ class MemoryExtension(ResumableEstimator):
     ) -> VectorEstimates:
         mesh, values, p = extended.mesh, extended.values, regression.p
         omega, rhs = Trajectory(mesh, values[..., :p]), Trajectory(mesh, values[..., p:])
-        law = VectorLaw(None, omega, rhs, regression.floor)
+        law = VectorLaw(None, omega, rhs, regression.floor * regression.units)
         return vector_estimates(self, regression, law, omega, t)
 
 

@@ -16,10 +16,10 @@ from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Direction, OnDemand, Requirement, evaluated
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import largest, symmetric_eigenvalues
+from gpebo_cli.numerics.linalg import symmetric_eigenvalues
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.linear import LinearRegression, interpolation_error
-from gpebo_cli.regression.resets import ExtensionState, Reset
+from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
@@ -244,7 +244,8 @@ def window_level(
     counts for the parameters after it: T⁻ᵀ G T⁻¹, as in ``ExtensionState.after``.
     """
     level, start, slack = np.full(len(t), np.nan), t - window, 1e-12 * max(1.0, window)
-    gram, size, whole = np.zeros((0, 0, 0)), 0.0, np.zeros(0, dtype=np.intp)
+    gram, whole = np.zeros((0, 0, 0)), np.zeros(0, dtype=np.intp)
+    size: Array | float = 0.0
     for k, parts in enumerate(segments):
         for j, outer in enumerate(parts):
             low, high = outer.mesh.edges[[0, -1]]
@@ -254,7 +255,7 @@ def window_level(
             if k and not j:
                 for i in np.flatnonzero((start[whole] < low) & (t[whole] > low)):
                     gram[i] = ExtensionState(gram[i], size).after(resets[k - 1]).values
-            size = (size if j else 0.0) + largest(outer.integral().final) if resets else 0.0
+            size = (size if j else 0.0) + level_of(outer.integral().final) if resets else 0.0
             a, b = np.clip(start[whole], low, high), np.clip(t[whole], low, high)
             here = np.flatnonzero(b > a)
             gram[here] += between(outer, a[here], b[here])

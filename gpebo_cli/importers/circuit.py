@@ -334,15 +334,7 @@ class _Builder:
         row, column = self._voltage_row(e, "Ohm's law")
         self.draft.add("A", row, column, f"-{name}")
 
-    def _stamp_S(self, e: Element) -> None:
-        name, column = self._value(e), self._current.get(e.name.lower())
-        if column is None:
-            self._admittance("A", e.nodes, name, e.nodes[::-1])
-            return
-        row = self.draft.equation(f"{e.name}: current of the switch, a conductance")
-        self._between("A", row, e.nodes[0], e.nodes[1], name)
-        self.draft.add("A", row, column, -1.0)
-        self._branch(e.nodes, column)
+    _stamp_S = _stamp_R
 
     def _stamp_C(self, e: Element) -> None:
         name = self._value(e)
@@ -447,7 +439,7 @@ class _Builder:
         """Currents of resistors that nothing is said of, from the voltages that they start with."""
         states, parameters = self.draft.states, self.draft.parameters
         found = [
-            e for e in self.netlist.elements if e.kind == "R" and e.name.lower() in self._current
+            e for e in self.netlist.elements if e.kind in "RS" and e.name.lower() in self._current
             and f"i({e.name.lower()})" not in self.netlist.initial
         ]
         if not found:

@@ -425,7 +425,7 @@ class _Reader:
         return Element(kind, name, where, value, place, controls, initial)
 
     def _switch(self, options: Mapping[str, str], scope: _Scope, name: str) -> str:
-        """The conductance of a switch that closes and opens at given instants."""
+        """The resistance of a switch that closes and opens at given instants."""
         place = scope.place
         if "on" not in options and "off" not in options:
             raise place.error(f"{name} needs its instants, as in S1 a b on=1,3 off=2 ron=1m")
@@ -443,7 +443,7 @@ class _Reader:
             closed += f" {'+' if sign > 0 else '-'} step(t - {time!r})"
         ron = self.value(options.get("ron", "1m"), scope, name)
         roff = self.value(options.get("roff", "1g"), scope, name)
-        return f"1/({roff}) + (1/({ron}) - 1/({roff}))*({closed})"
+        return f"1/(1/({roff}) + (1/({ron}) - 1/({roff}))*({closed}))"
 
     def _source(self, rest: list[str], scope: _Scope, name: str) -> float | str:
         place = scope.place

@@ -38,7 +38,7 @@ from gpebo_cli.numerics.mesh import (
     unresolved,
     unresolved_kinds,
 )
-from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
 
@@ -230,12 +230,9 @@ def _element_maps(
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
-        if known is None:
+        c = known
+        if c is None or len(h) > chunk:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
-        elif len(h) <= chunk:
-            c = known
-        else:
-            c = _at_points(known, slice(i * (s + 1), (i + chunk) * (s + 1)))
         maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
         if len(h) <= chunk:
             return maps
@@ -254,18 +251,6 @@ def _is_constant(c: LinearEquation) -> bool:
     """Whether everything but the forcing is constant in time."""
     basis = None if c.constraints is None else c.constraints.basis
     return all(matrix is None or len(matrix) == 1 for matrix in (c.E, c.A, basis))
-
-
-def _at_points(c: LinearEquation, part: slice) -> LinearEquation:
-    """The coefficients at some of their times."""
-
-    def some(values: Array) -> Array:
-        return values if len(values) == 1 else values[part]
-
-    return LinearEquation(
-        None if c.E is None else some(c.E), some(c.A), some(c.f), tuple(map(some, c.extras)),
-        None if c.constraints is None else Constraints(*map(some, c.constraints)),
-    )
 
 
 def at_points(values: Array, k: int, s: int) -> Array:
@@ -392,8 +377,6 @@ def _chain(
     for first, last in pairwise(cuts):
         if first:
             state = restarts[edges[first]](state)
-            if renew is not None:
-                state = renew(state)
         part = slice(first, last)
         own = homogeneous if len(homogeneous) == 1 else homogeneous[part]
         values, finite = elements.chain(own, particular[part], state, renew)

@@ -67,10 +67,7 @@ def exact_product(left: Array, right: Array) -> Array:
 def inverse_or_none(whole: Array) -> tuple[Array, BoolArray]:
     """Inverses (N, n, n), and at which of the N there is none."""
     inverse = inverses(whole)
-    finite = np.isfinite(inverse)
-    if finite.all():
-        return inverse, np.zeros(len(inverse), dtype=bool)
-    return inverse, np.asarray(~finite.all(axis=(1, 2)))
+    return inverse, np.asarray(~np.isfinite(inverse).all(axis=(1, 2)))
 
 
 def orthonormal_complement(basis: Array) -> Array:
@@ -140,32 +137,10 @@ def affine_scan(factor: Array, shift: Array, start: Array) -> Array:
     return out
 
 
-def largest(extended: Array) -> float:
-    """‖Ω‖₂ of [Ω | 𝒴] (..., p, p + c), the largest of all.
-
-    Singular values are computed only of matrices whose Frobenius norm leaves room for a larger one
-    than that of the matrix with the largest Frobenius norm.
-    """
-    p = extended.shape[-2]
-    flat = extended[..., :p].reshape(-1, p, p) if extended.size else np.zeros((0, p, p))
-    size = float(np.abs(flat).max(initial=0.0))
-    if size == 0.0 or not np.isfinite(size):
-        return size
-    flat = flat / size  # squares neither overflow nor vanish
-    frobenius = np.sqrt(np.einsum("nij,nij->n", flat, flat))
-    norm = float(np.linalg.svd(flat[np.argmax(frobenius)], compute_uv=False)[0])
-    rest = flat[frobenius > norm * (1.0 + 1e-12)]
-    if len(rest) > 1:
-        norm = max(norm, float(np.linalg.svd(rest, compute_uv=False)[:, 0].max()))
-    return norm * size
-
-
 def triangular(pieces: Iterable[Array]) -> Array:
     """R (k, c) with RᵀR = ΣAᵀA of rows A (N, c) that come piece by piece."""
-    found: Array | None = None
+    found: Array = np.zeros(0)
     for rows in pieces:
-        whole = rows if found is None else np.concatenate([found, rows])
+        whole = np.concatenate([found.reshape(-1, rows.shape[1]), rows])
         found = np.asarray(np.linalg.qr(whole, mode="r"))
-    if found is None:
-        raise ValueError("there are no rows")
     return found

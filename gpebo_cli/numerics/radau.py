@@ -38,23 +38,9 @@ class RadauRule:
     # (j,) powers that make of each of the last j coefficients the next one: (ρ^k)^this = ρ^(s + 1)
     to_next: Array
 
-    @property
-    def order(self) -> int:
-        """Order of the values at element ends."""
-        return 2 * self.stages - 1
-
     def interpolation(self, places: Array) -> Array:
         """From values at ``points`` to those at ``places`` (M,) in [0, 1], shape (M, s + 1)."""
-        return _interpolation(self, places.tobytes())
-
-
-@lru_cache(maxsize=64)
-def _interpolation(rule: RadauRule, places: bytes) -> Array:
-    """:meth:`RadauRule.interpolation`, of float64; not to be written to."""
-    x = 2.0 * np.frombuffer(places) - 1.0
-    matrix = np.asarray(legendre.legvander(x, rule.stages) @ rule.to_legendre)
-    matrix.flags.writeable = False
-    return matrix
+        return np.asarray(legendre.legvander(2.0 * places - 1.0, self.stages) @ self.to_legendre)
 
 
 @lru_cache(maxsize=16)

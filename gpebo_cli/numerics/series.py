@@ -10,9 +10,8 @@ full and constant with one factorisation for all elements of one length.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import lru_cache, partial
-from itertools import pairwise
 from math import factorial
 from typing import Any, NamedTuple
 
@@ -38,7 +37,6 @@ _DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
-_IN_CACHE = 1 << 13  # numbers
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
 _FEW_COLUMNS = 4  # whose errors are carried one by one
@@ -125,8 +123,7 @@ def sparse(A: Array) -> Sparse | None:
 
 def solve(
     problem: LinearProblem, equation: Callable[[Mesh], Equation], mesh: Mesh, *,
-    units: Array, tol: float, max_elements: int,
-    restarts: Mapping[float, Callable[[Array], Array]] | None = None, stiff: bool = False,
+    units: Array, tol: float, max_elements: int, stiff: bool = False,
 ) -> LinearSolution | None:
     """As :func:`gpebo_cli.numerics.collocation.solve`, or None where series will not do.
 
@@ -152,7 +149,10 @@ def solve(
     def evaluate(mesh: Mesh, before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
         del before
         A, f, extras = equation(mesh)
-        values, change = _marched(march, A, f, problem, mesh, tol, restarts or {})
+        enough = max(_DIGITS * tol, 8.0 * EPS)
+        values, change = march(mesh, A, f, None, problem.start, enough)
+        if (change[np.isfinite(change)] > 8.0 * enough).any() or not np.isfinite(values[-1]).all():
+            raise StiffError
         looked = Looked.at(values, mesh.rule)
         sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
         made_of, moved = _terms(A, f, mesh, values, sizes)
@@ -165,7 +165,7 @@ def solve(
     try:
         mesh, found, tail = refine(
             evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
-            patience=1 + stiff, fixed=restarts or (),
+            patience=1 + stiff,
         )
     except StiffError:
         return None
@@ -282,13 +282,8 @@ def _powers(degrees: Array, parts: IntArray | None = None) -> Array:
 
 def _largest_shares(values: Array, size: Array) -> Array:
     """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
-    some = min(len(values), max(1, _IN_CACHE // max(values[0].size, 1)))
-    found, held, rate = np.empty(values.shape[:2]), np.empty((some, *values.shape[1:])), 1.0 / size
-    for first in range(0, len(values), some):
-        part = values[first : first + some]
-        shares = np.multiply(part, rate, out=held[: len(part)])
-        np.abs(shares, out=shares).max(axis=2, initial=0.0, out=found[first : first + some])
-    return found
+    of_powers = np.moveaxis(values, 1, 0)
+    return np.stack([np.abs(one / size).max(axis=1, initial=0.0) for one in of_powers], axis=1)
 
 
 @lru_cache
@@ -330,31 +325,6 @@ class _Solved:
             self._factors[known] = lu_factor(matrix, overwrite_a=True)
         solved = lu_solve(self._factors[known], right, check_finite=False)
         return np.asarray(solved, dtype=np.complex128)
-
-
-def _marched(
-    march: March, A: Sparse, f: Array, problem: LinearProblem, mesh: Mesh, tol: float,
-    restarts: Mapping[float, Callable[[Array], Array]],
-) -> tuple[Array, Array]:
-    """Values (K, s + 1, d, c), and the last change in each element (K,), or StiffError."""
-    edges, state = mesh.edges.tolist(), problem.start
-    cuts = [0, *(k for k in range(1, mesh.size) if edges[k] in restarts), mesh.size]
-    pieces = []
-    enough = max(_DIGITS * tol, 8.0 * EPS)
-    for first, last in pairwise(cuts):
-        if first:
-            state = restarts[edges[first]](state)
-        part = slice(first * len(mesh.rule.points), last * len(mesh.rule.points))
-        own = A if len(A.entries) == 1 else A._replace(entries=A.entries[part])
-        piece = Mesh(mesh.edges[first : last + 1], mesh.rule)
-        values, change = march(piece, own, f if len(f) == 1 else f[part], None, state, enough)
-        if (change[np.isfinite(change)] > 8.0 * enough).any() or not np.isfinite(values[-1]).all():
-            raise StiffError
-        pieces.append((values, change))
-        state = values[-1, -1]
-    if len(pieces) == 1:
-        return pieces[0]
-    return np.concatenate([v for v, _ in pieces]), np.concatenate([c for _, c in pieces])
 
 
 def _terms(

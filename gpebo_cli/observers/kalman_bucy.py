@@ -47,7 +47,7 @@ from gpebo_cli.observers._base import (
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
 from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
-from gpebo_cli.observers.reduced.split import Split
+from gpebo_cli.observers.reduced.split import Split, units_along
 from gpebo_cli.observers.reduced.system import ReducedSystem, reduced_system
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
@@ -97,7 +97,9 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
     A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
     off = np.eye(k) - dual @ o.split.projector @ basis
-    damping = np.linalg.norm(o.dynamics, axis=(1, 2))[:, None, None] * off
+    own = units_along(basis, form.units.states)
+    rate = np.linalg.norm(o.dynamics * own / own[:, None], axis=(1, 2))
+    damping = rate[:, None, None] * off
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
     inward = np.zeros((count, q + k, signals.shape[1]))
     inward[:, q:] = o.from_signals
@@ -267,6 +269,7 @@ class KalmanBucy:
         known_of = reduced(mesh.points.ravel(), inside)
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
+        of_states = known.form.units.states, known.form.units.states[:, None] / sizes
         varies = np.where(variances > 0.0, variances, sizes**2 * (
             (variances / sizes**2).max(initial=0.0) or 1.0
         ))
@@ -276,7 +279,9 @@ class KalmanBucy:
         )
         regularised = bool(model_noise.measured(known_of, steps(inside))[2].any())
         # What w is beside the part of x that is known may be rounding of that, added up.
-        turns = 1.0 + float(np.abs(known_of.A).max() * (mesh.edges[-1] - mesh.edges[0]))
+        turns = 1.0 + float(
+            np.abs(known_of.A * sizes / sizes[:, None]).max() * (mesh.edges[-1] - mesh.edges[0])
+        )
         beside = turns * np.abs(split.dual) @ np.abs(known_of.offset).max(axis=0)
         floor = _ROUNDING / solver.tol * np.concatenate([np.zeros(q), beside])
 
@@ -286,8 +291,8 @@ class KalmanBucy:
             return space, (s.offset, s.gain, s.direct, s.projector)
 
         def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
-            offset, gain, *_ = extras
-            x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0])
+            offset, gain = (e / units for e, units in zip(extras, of_states, strict=False))
+            x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0] / sizes)
             return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
 
         used: dict[str, float | int | str | None] = {
@@ -298,22 +303,24 @@ class KalmanBucy:
         share = f"{self.regularisation:g} of each equation's own under P0 "
         if regularised:
             used["regularised_with"] = f"noise of {share}at {noise.sample_time:g} s"
-        name = f"Kalman-Bucy filter of plant {system.name}"
         filtered = run_filter(
             model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
-            monitor=monitor, name=name, floor=floor, sizes=sizes,
+            monitor=monitor, floor=floor, sizes=sizes,
+            name=f"Kalman-Bucy filter of plant {system.name}",
         )
         offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
             m = model_noise.state_space(reduced(t, inside), q, split, steps(inside))
-            return m.A, transpose(m.c) @ np.linalg.solve(m.V, m.c)
+            return m.A * sizes / sizes[:, None], sizes[:, None] * sizes * (
+                transpose(m.c) @ np.linalg.solve(m.V, m.c)
+            )
 
         windows = window_gramians(
             information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
             max_elements=solver.max_elements,
         )
-        observability = _uniform_observability(windows, P0, projector, known)
+        observability = _uniform_observability(windows, P0, projector, known, sizes)
         return Observation(
             regression=evidence.regression,
             state_map=FilterStateMap(
@@ -355,13 +362,16 @@ def _initial_covariance(variances: Array, known: ReducedSystem) -> Array:
 
 
 def _uniform_observability(
-    windows: WindowGramians, P0: Array, projector: Trajectory, known: ReducedSystem
+    windows: WindowGramians, P0: Array, projector: Trajectory, known: ReducedSystem, sizes: Array
 ) -> Requirement:
-    """λ_min of M over all windows, in units of P(0)⁻¹, in the directions that ζ has."""
+    """λ_min of M, of ζ in units of ``sizes`` (n,), over all windows, in units of P(0)⁻¹.
+
+    It is that in the directions that ζ has.
+    """
     P = projector(windows.starts)
     n, q = len(P0), known.system.q
-    inside = _inside(q, known.first.split, P)
-    scale = np.sqrt(np.diag(P0))
+    inside = _inside(q, known.first.split, P) * sizes / sizes[:, None]
+    scale = np.sqrt(np.diag(P0)) / sizes
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
     values = np.linalg.eigvalsh(M)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -79,9 +78,7 @@ class Structure:
     @property
     def growth(self) -> float:
         """Largest real part of its eigenvalues at the probes, 1/s, or zero."""
-        if self.dynamics is None or not self.d:
-            return 0.0
-        return max(0.0, float(_largest_real_parts(self.dynamics).max()))
+        return 0.0 if self.dynamics is None else float(_growth(self.dynamics).max())
 
 
 def without_equations() -> Structure:
@@ -101,21 +98,12 @@ def who(system: DescriptorSystem) -> str:
 
 def growth_rates(E1: Array, A1: Array, basis: Array | None) -> Array:
     """Largest real part (N,) of the eigenvalues of z' = A1 T z, E1 T = I, or zero, in 1/s."""
-    if not len(E1[0]):
-        return np.zeros(len(E1))
-    frozen = np.asarray(np.linalg.solve(E1, A1) if basis is None else A1 @ basis, dtype=np.float64)
-    return np.maximum(_largest_real_parts(frozen), 0.0)
+    return _growth(np.asarray(np.linalg.solve(E1, A1) if basis is None else A1 @ basis))
 
 
-def _largest_real_parts(matrices: Array) -> Array:
-    """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), d > 0."""
-    if matrices.shape[1] == 1:
-        return matrices[:, 0, 0]
-    if matrices.shape[1] == 2:
-        first, last = matrices[:, 0, 0], matrices[:, 1, 1]
-        squared = (0.5 * (first - last)) ** 2 + matrices[:, 0, 1] * matrices[:, 1, 0]
-        return np.asarray(0.5 * (first + last) + np.sqrt(np.maximum(squared, 0.0)))
-    return np.asarray(np.linalg.eigvals(matrices).real.max(axis=1))
+def _growth(matrices: Array) -> Array:
+    """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), or zero."""
+    return np.asarray(np.linalg.eigvals(matrices).real.max(axis=1, initial=0.0))
 
 
 def analyse(
@@ -214,12 +202,12 @@ def _in_stages(
         e, a = scaled(c.E, c.A, s.rows, s.columns, s.time, mu + 1)
         return in_stages(e, a, np.zeros((mu + 1, 1, system.n, 0)), rank_tol, 1, ranks)
 
-    def lines(t: Array, c: Coefficients, column: IntArray, which: IntArray) -> Array:
+    def lines(t: Array, c: Coefficients, column: IntArray) -> Array:
         try:
             smallest = found(c).smallest
         except UnclearError as unclear:
             raise unclear_ranks(system, t, unclear) from unclear
-        return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[which, :, column])
+        return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column])
 
     while True:
         c = system.coefficients.taylor(t, mu)
@@ -292,12 +280,7 @@ def _refuse_overflow(
     """LAPACK's singular values of what is not finite may take for ever."""
     with np.errstate(all="ignore"):
         weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
-        heaviest = np.square(weight.max(initial=0.0))
-        # A sum is finite only where all its terms are; a finite one says it at once.
-        E, A = distinct(c.E), distinct(c.A)
-        finite = isfinite(heaviest * (np.vdot(E, E) + np.vdot(A, A))) or all(
-            np.isfinite(x * weight).all() for x in (E, A)
-        )
+        finite = all(np.isfinite(distinct(x) * weight).all() for x in (c.E, c.A))
     if not finite:
         raise ModelError(
             f"{who(system)}: E and A change by more powers of ten than numbers hold; shorten "
@@ -448,7 +431,7 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
 
 def _follow_dips(
     system: DescriptorSystem, t: Array, smallest: Array, mu: int, rank_tol: float,
-    lines: Callable[[Array, Coefficients, IntArray, IntArray], Array],
+    lines: Callable[[Array, Coefficients, IntArray], Array],
 ) -> bool:
     """Follow local minima of the decisive singular values (N, 3); whether there is none inside.
 
@@ -468,15 +451,10 @@ def _follow_dips(
     for _ in range(_DIP_ROUNDS):
         if not len(column):
             break
-        # Dips of several columns at one time share a grid.
-        brackets = list(zip(left.tolist(), right.tolist(), strict=True))
-        own = list(dict.fromkeys(brackets))
-        which = np.array([own.index(bracket) for bracket in brackets], dtype=np.intp)
-        start, stop = np.array(own).T[..., None]
-        grid = start + (stop - start) * _CUTS
-        grid[:, -1:] = stop
+        grid = left[:, None] + (right - left)[:, None] * _CUTS
+        grid[:, -1] = right
         c = system.coefficients.taylor(grid.ravel(), mu)
-        values = lines(grid.ravel(), c, column, which)
+        values = lines(grid.ravel(), c, column)
         dip, best = np.arange(len(values)), values.argmin(axis=1)
         before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
         value = values[dip, best]
@@ -484,13 +462,13 @@ def _follow_dips(
         lost = lowest <= zero[column]
         if lost.any():
             i = int(np.argmax(lost))
-            where = grid[which[i], best[i]]
+            where = grid[i, best[i]]
             raise ModelError(
                 f"{who(system)}: the rank of the {names[column[i]]} changes at t = {where:.9g} "
                 f"(singular value {lowest[i]:.1e}); choose a horizon that avoids this time"
             )
         falls = value < 0.5 * np.maximum(values[dip, before], values[dip, after])
-        left, right = grid[which, before][falls], grid[which, after][falls]
+        left, right = grid[dip, before][falls], grid[dip, after][falls]
         column, lowest = column[falls], lowest[falls]
     return steady
 
@@ -499,23 +477,23 @@ _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
 def _lines(
-    _: Array, c: Coefficients, column: IntArray, which: IntArray, *, mu: int, scaling: Scaling,
-    rank_tol: float, a: int, reference: Pivots,
+    _: Array, c: Coefficients, column: IntArray, *, mu: int, scaling: Scaling, rank_tol: float,
+    a: int, reference: Pivots,
 ) -> Array:
     """Columns (D,) of the levels that belong to ``a`` constraints, (D, points).
 
-    Each is looked at in one (D,) of the grids whose times, one after the other, are those of c.
-    Bounds of them from below serve as well, where none of them comes near zero.
+    The times of c are those of one grid for each, one after the other. Bounds of them from below
+    serve as well, where none of them comes near zero.
     """
     model = scaling.rows, scaling.columns, scaling.time, mu + 1
     bounds, left, _ = kernels.structure.bounds(
         c.E, c.A, *model, reference.rows, reference.columns, reference.rank, reference.Z1
     )
-    lines = bounds.reshape(-1, _DIP_POINTS, 3)[which, :, column]
+    lines = bounds.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column]
     sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
-    sound &= (left.reshape(-1, _DIP_POINTS)[which] <= RESIDUAL).all(axis=1)
+    sound &= (left.reshape(-1, _DIP_POINTS) <= RESIDUAL).all(axis=1)
     for i in np.flatnonzero(~sound).tolist():
-        some = slice(which[i] * _DIP_POINTS, (which[i] + 1) * _DIP_POINTS)
+        some = slice(i * _DIP_POINTS, (i + 1) * _DIP_POINTS)
         E, A = (x if x.shape[1] == 1 else x[:, some] for x in (c.E, c.A))
         lines[i] = kernels.structure.levels(E, A, *model, rank_tol, a)[1][:, column[i]]
     return np.asarray(lines)

@@ -23,6 +23,7 @@ class Dynamics:
     A: Trajectory  # (p, p)
     b: Trajectory  # (p,)
     forgetting: float  # 1/s ρ: what is known of directions that decay must fade as fast as it grows
+    units: Array  # (p,) in which parameters are comparable
 
 
 def filtered(
@@ -36,13 +37,17 @@ def filtered(
     square of their inverse, which the forgetting ρ makes up for. ``outer`` is [ψᵀψ | ψᵀy]
     (p, p + 1), and Λ and Γ have the diagonals ``rates`` and ``gains`` (p,).
     """
-    p = outer.values.shape[2]
-    start = np.zeros((p, p + 1)) if start is None else start
+    p, units = outer.values.shape[2], dynamics.units
+    # It is solved for comparable parameters: what is small in its unit only is no rounding.
+    own = units[:, None] * np.append(units, 1.0)
+    start = np.zeros((p, p + 1)) if start is None else own * start
+    outer = Trajectory(outer.mesh, own * outer.values)
+    turn = Trajectory(dynamics.A.mesh, dynamics.A.values * units / units[:, None])
     eye = np.eye(p)
     decay = np.diag(rates + dynamics.forgetting)
 
     def of_omega(t: Array, inside: Array) -> LinearEquation:
-        A = dynamics.A(t, inside)
+        A = turn(t, inside)
         left = -(decay + transpose(A))
         M = np.einsum("nij,kl->nikjl", left, eye) - np.einsum("ij,nlk->nikjl", eye, A)
         f = gains[:, None] * outer(t, inside)[..., :p]
@@ -53,9 +58,9 @@ def filtered(
 
     def of_rhs(t: Array, inside: Array) -> LinearEquation:
         sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
-        f = np.einsum("nij,nj->ni", sampled, dynamics.b(t, inside))
+        f = np.einsum("nij,nj->ni", sampled, dynamics.b(t, inside) / units)
         f = f + gains * outer(t, inside)[..., p]
-        return LinearEquation(None, -(decay + transpose(dynamics.A(t, inside))), f[..., None])
+        return LinearEquation(None, -(decay + transpose(turn(t, inside))), f[..., None])
 
     # From the mesh of Ω on: in one of its elements Ω is a polynomial.
     problem = LinearProblem(of_rhs, start[:, p:], name="filter of the regression")
@@ -64,4 +69,4 @@ def filtered(
     both = np.concatenate(
         [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2
     )
-    return rhs.mesh.trajectory(both)
+    return rhs.mesh.trajectory(both / own)

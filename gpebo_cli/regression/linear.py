@@ -10,12 +10,12 @@ from itertools import pairwise
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import largest, triangular
+from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.parametrisation import Parametrisation
-from gpebo_cli.regression.resets import ExtensionState, Reset
+from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
 
 _MANY = 16  # parameters, from which on G at the end is made without those at all other points
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
@@ -40,7 +40,8 @@ class LinearRegression:
     parameters: tuple[str, ...]
     scale: Array | float = field(repr=False)  # (p,), or (K, p): so far, element by element
     resets: tuple[Reset, ...] = ()  # at edges of the mesh, in the order of time
-    floor: float = 0.0  # size below which parameters are rounding
+    floor: float = 0.0  # size below which comparable parameters are rounding
+    units: Array | float = 1.0  # (p,) in which they are comparable
     dynamics: Dynamics | None = None  # of parameters that move; then there are no resets
     parametrisation: Parametrisation | None = None  # η = S(θ)
     # Where Y is the projection of what was measured, |factor [−η; 1]|² is ∫‖Y − ψη‖² of that.
@@ -97,11 +98,11 @@ class LinearRegression:
             held = self.p < _MANY or "outer" in vars(self)
             return (self if held else replace(self)).outer.integral()
         pieces, known = [], np.zeros((self.p, self.p + 1))
-        level = 0.0
+        level: Array | float = 0.0
         for segment, reset in zip(self.segments, (*self.resets, None), strict=True):
             own = segment.outer.integral()
             pieces.append(own.values + known)
-            level = max(level, largest(own.final))
+            level = np.maximum(level, level_of(own.final))
             if reset is not None:
                 known = ExtensionState(pieces[-1][-1, -1], level).after(reset).values
         return Trajectory(self.mesh, np.concatenate(pieces))
@@ -179,11 +180,11 @@ class LinearRegression:
         if not self.resets:
             return (self,)
         cuts = np.searchsorted(self.mesh.edges, [reset.time for reset in self.resets])
-        floors = (self.floor, *(reset.floor for reset in self.resets))
+        about = [(self.floor, self.units), *((own.floor, own.units) for own in self.resets)]
         return tuple(
-            self._part(first, last, floor)
-            for (first, last), floor in zip(
-                pairwise([0, *cuts.tolist(), self.mesh.size]), floors, strict=True
+            replace(self._part(first, last), floor=floor, units=units)
+            for (first, last), (floor, units) in zip(
+                pairwise([0, *cuts.tolist(), self.mesh.size]), about, strict=True
             )
         )
 
@@ -197,7 +198,7 @@ class LinearRegression:
             return
         for first in range(0, self.mesh.size, self._window):
             last = min(first + self._window, self.mesh.size)
-            yield replace(self._part(first, last, self.floor), whole=self)
+            yield replace(self._part(first, last), whole=self)
 
     @property
     def long(self) -> bool:
@@ -211,14 +212,13 @@ class LinearRegression:
         each = len(self.mesh.rule.points) * self.p * (self.p + 1)
         return max(1, min(_WINDOW, _AT_ONCE // max(1, each)))
 
-    def _part(self, first: int, last: int, floor: float) -> LinearRegression:
+    def _part(self, first: int, last: int) -> LinearRegression:
         """The elements from one number to another, without what was before."""
         piece, own = Mesh(self.mesh.edges[first : last + 1], self.mesh.rule), slice(first, last)
         scale = np.broadcast_to(self.scale, (self.mesh.size, self.p))
         return replace(
             self, Y=Trajectory(piece, self.Y.values[own]),
-            psi=Trajectory(piece, self.psi.values[own]), resets=(), floor=floor, scale=scale[own],
-            factor=None,
+            psi=Trajectory(piece, self.psi.values[own]), resets=(), scale=scale[own], factor=None,
         )
 
 

@@ -21,9 +21,11 @@ class Reset:
     time: float
     transform: Array  # (p, p) T, invertible
     shift: Array  # (p,) τ
-    floor: float  # size below which η₊ is rounding: it may be the difference of known numbers
+    floor: float  # size of comparable η₊ that is rounding: it may be a difference of known numbers
     keep: float = 1.0  # share of what is known that still counts
     errors: Array | None = None  # (p, k) what an error ζ of w adds to η₊; None: nobody knows
+    before: Array | float = 1.0  # (p,) units in which η is comparable, and
+    units: Array | float = 1.0  # (p,) those of η₊
 
     def parameters(self, eta: Array) -> Array:
         """η₊ of η (..., p)."""
@@ -35,7 +37,7 @@ class ExtensionState:
     """What is known of η at one time: Ω η = 𝒴, and how much of it is new."""
 
     values: Array  # [Ω | 𝒴] (p, p + 1)
-    level: float  # size that data of one segment alone have given Ω, the largest so far
+    level: Array | float  # (p,) the diagonal of Ω from one segment's data alone, the largest so far
     memory: float = 1.0  # z of least squares with forgetting
     surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
     energy: float = 0.0  # ∫Δ² of a law behind it since it began
@@ -53,7 +55,10 @@ class ExtensionState:
         With Ω = KᵀL, equal factors for a Gram matrix, the columns of L T⁻¹ are of very different
         sizes; QR with the largest first keeps them apart, and a row of R is cut as a whole.
         """
-        omega, rhs = self.values[:, :-1], self.values[:, -1]
+        p = len(self.values)
+        before, units = (np.broadcast_to(u, p) for u in (reset.before, reset.units))
+        omega, rhs = self.values[:, :-1] * before * before[:, None], before * self.values[:, -1]
+        transform, level = reset.transform * before / units[:, None], self.level * before**2
         symmetric = bool(np.abs(omega - omega.T).max() <= _SYMMETRIC * np.abs(omega).max())
         u, size, vt = np.linalg.svd(0.5 * (omega + omega.T) if symmetric else omega)
         root = np.sqrt(size)
@@ -61,25 +66,25 @@ class ExtensionState:
             u.T @ rhs, root, out=np.zeros_like(root),
             where=size > max(_SINGULAR * size[0], np.finfo(float).tiny),
         )  # of L η
-        U, sigma, Vt = np.linalg.svd(reset.transform)
+        U, sigma, Vt = np.linalg.svd(transform)
         inverse = Vt.T / np.maximum(sigma, _SINGULAR * sigma[0])  # T⁻¹ = inverse Uᵀ
         left, right = root[:, None] * (u.T @ inverse), root[:, None] * (vt @ inverse)
         order = np.argsort(-np.linalg.norm(right, axis=0), kind="stable")
         q, r = np.linalg.qr(right[:, order])
-        limit = np.sqrt(self.surplus * self.level)
+        limit = np.sqrt(self.surplus * level.sum())
         share = _share(r, limit)
         right[:, order] = share * r
-        rhs = share[:, 0] * (q.T @ rhs) + right @ (U.T @ reset.shift)
+        rhs = share[:, 0] * (q.T @ rhs) + right @ (U.T @ (reset.shift / units))
         if symmetric:
             left = right.T  # equal but for rounding, which would add up from reset to reset
         else:
             left = (share * (q.T @ left)).T
             left *= _share(left, limit * np.sqrt(len(left)))
-        values = U @ left @ np.column_stack([right @ U.T, rhs])
+        values = (U / units[:, None]) @ left @ np.column_stack([right @ (U.T / units), rhs])
         # What nothing was known of, and what no other one has become, is no rounding of others.
         idle = ~omega.any(axis=0) & (reset.transform == np.eye(len(omega))).all(axis=0)
         values[idle], values[:, :-1][:, idle] = 0.0, 0.0
-        return replace(self, values=reset.keep * values, energy=0.0)
+        return replace(self, values=reset.keep * values, energy=0.0, level=level / units**2)
 
     def carries(self, reset: Reset) -> Array:
         """S (p, p) of :meth:`after`: what it makes of an error of 𝒴."""
@@ -92,6 +97,12 @@ class ExtensionState:
 
 Known = Sequence[ExtensionState]
 """Extensions that are known at the start of a segment; none: they start at zero."""
+
+
+def level_of(values: Array) -> Array:
+    """Size of the diagonal (p,) of matrices (…, p, p + c)."""
+    diagonal = np.abs(np.diagonal(values, axis1=-2, axis2=-1))
+    return np.asarray(diagonal.reshape(-1, diagonal.shape[-1]).max(axis=0, initial=0.0))
 
 
 def _share(rows: Array, limit: float) -> Array:

@@ -34,7 +34,7 @@ _MOST_CELLS = 1 << 15
 _MOST_VALUES = 1 << 20  # of all expressions in all cells, where these are more
 _AT_ONCE = 1 << 14  # cells whose bounds are held at the same time
 # No narrower than a signal; kinks and jumps are edges.
-_POLYNOMIAL = {"add", "subtract", "multiply", "negative", "signal", "abs", "sign", "min", "max"}
+_POLYNOMIAL = {"add", "multiply", "negative", "signal", "abs", "sign", "min", "max"}
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds, and
 _FOR_EACH = 2  # cells for each element of those, if these are more
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one

@@ -48,30 +48,15 @@ def negative(a: Jet, order: int) -> Jet:
     return [-c for c in a[: order + 1]]
 
 
-def subtract(a: Jet, b: Jet, order: int) -> Jet:
-    """a - b."""
-    common = min(order + 1, len(a), len(b))
-    rest = a[common : order + 1] if len(a) > len(b) else negative(b[common:], order - common)
-    return [*(a[k] - b[k] for k in range(common)), *rest]
-
-
 def multiply(a: Jet, b: Jet, order: int) -> Jet:
     """a b."""
-    if len(a) == 1:
-        return [a[0] * c for c in b[: order + 1]]
-    if len(b) == 1:
-        return [c * b[0] for c in a[: order + 1]]
     return [convolve(a, b, k) for k in range(min(order, len(a) + len(b) - 2) + 1)]
 
 
 def divide(a: Jet, b: Jet, order: int) -> Jet:
     """q = a / b, from q b = a."""
-    if len(b) == 1:
-        # A float of NumPy's divides by zero as arrays do: by raising a flag.
-        divisor = np.float64(b[0]) if isinstance(b[0], float) else b[0]
-        return [c / divisor for c in a[: order + 1]]
     q: Jet = [np.divide(a[0], b[0])]
-    for k in range(1, order + 1):
+    for k in range(1, min(order + 1, len(a) if len(b) == 1 else order + 1)):
         rest = (a[k] if k < len(a) else 0.0) - convolve(b, q, k, first=1)
         q.append(np.divide(rest, b[0]))
     return q
@@ -119,7 +104,7 @@ def exp(a: Jet, order: int) -> Jet:
 
 def _around_one(a: Jet, order: int) -> Jet:
     """1 - a²."""
-    return multiply(subtract([1.0], a, order), add([1.0], a, order), order)
+    return multiply(add([1.0], negative(a, order), order), add([1.0], a, order), order)
 
 
 # Each function whose derivative is a'/g, with what NumPy calls it and g as a function of a. Factors
@@ -222,7 +207,6 @@ UNARY: dict[str, Callable[[Jet, int], Jet]] = {
 }
 BINARY: dict[str, Callable[[Jet, Jet, int], Jet]] = {
     "add": add,
-    "subtract": subtract,
     "multiply": multiply,
     "divide": divide,
 }

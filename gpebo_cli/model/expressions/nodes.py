@@ -107,20 +107,16 @@ def _is(a: Node, value: float) -> bool:
     return a.is_number and a.value == value
 
 
-def _sum(a: Node, b: Node, sign: float) -> tuple[float, float] | None:
-    """(c, s) of a ± b."""
-    if a.affine is None or b.affine is None:
-        return None
-    return a.affine[0] + sign * b.affine[0], a.affine[1] + sign * b.affine[1]
-
-
 def add(a: Node, b: Node) -> Node:
     """a + b."""
     if a.is_number and b.is_number:
         return _fold(operator.add, a.value, b.value)
     if _is(a, 0.0):
         return b
-    return a if _is(b, 0.0) else _node("add", a, b, affine=_sum(a, b, 1.0))
+    if _is(b, 0.0):
+        return a
+    affine = a.affine and b.affine and (a.affine[0] + b.affine[0], a.affine[1] + b.affine[1])
+    return _node("add", a, b, affine=affine)
 
 
 def negative(a: Node) -> Node:
@@ -134,11 +130,7 @@ def negative(a: Node) -> Node:
 
 def subtract(a: Node, b: Node) -> Node:
     """a - b."""
-    if a.is_number and b.is_number:
-        return _fold(operator.sub, a.value, b.value)
-    if _is(a, 0.0):
-        return negative(b)
-    return a if _is(b, 0.0) else _node("subtract", a, b, affine=_sum(a, b, -1.0))
+    return add(a, negative(b))
 
 
 def multiply(a: Node, b: Node) -> Node:

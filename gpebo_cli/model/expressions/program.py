@@ -69,16 +69,8 @@ class Recorder:
 
     def operation(self, name: str, left: Row | float, right: Row | float = 0.0) -> Row:
         """The row that an operation makes."""
-        if isinstance(left, Row) and name in ("multiply", "divide") and _is_one(right):
-            return left
-        if isinstance(right, Row) and name == "multiply" and _is_one(left):
-            return right
         key = (_OPERATIONS[name], self.operand(left), self.operand(right))
         return self.rows.setdefault(key, Row(self, self.given + len(self.rows)))
-
-
-def _is_one(value: Row | float) -> bool:
-    return not isinstance(value, Row) and float(value) == 1.0
 
 
 class Program(NamedTuple):

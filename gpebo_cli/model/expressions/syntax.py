@@ -100,7 +100,11 @@ def parse(
             "write a number or an expression (YAML reads on, off, yes and no as booleans)"
         )
     if isinstance(value, numbers.Real):
-        return Expression(_number(value, where), _number_text(value), where)
+        text = _number_text(value)
+        try:
+            return Expression(_number(value), text, where)
+        except FoldError:
+            raise ConfigError(f"{where} is {text}; write a finite number") from None
     if not isinstance(value, str):
         kind = "empty" if value is None else f"a {type(value).__name__}"
         raise ConfigError(f"{where} is {kind}; write a number or an expression")
@@ -122,14 +126,11 @@ def shorten(text: str, limit: int = 60) -> str:
     return repr(text)
 
 
-def _number(value: numbers.Real, where: str) -> Node:
+def _number(value: numbers.Real | float) -> Node:
     try:
-        finite = float(value)
+        return nodes.number(float(value))
     except OverflowError:
-        finite = math.inf
-    if not math.isfinite(finite):
-        raise ConfigError(f"{where} is {_number_text(value)}; write a finite number")
-    return nodes.number(finite)
+        raise FoldError("a number in it is too large") from None
 
 
 def _number_text(value: numbers.Real) -> str:
@@ -182,7 +183,9 @@ class _Reader:
             raise FoldError(f"it is nested more than {MAX_DEPTH} deep")
         match tree:
             case ast.Constant(value=value):
-                return self._constant(value)
+                if isinstance(value, bool) or not isinstance(value, int | float):
+                    raise FoldError(f"{shorten(str(value))} is not a real number")
+                return _number(value)
             case ast.Name(id=name):
                 return self._name(name)
             case ast.BinOp():
@@ -241,15 +244,6 @@ class _Reader:
         raise FoldError(
             f"the name {shorten(name)} is not defined{nearest(name, known)} (defined: {listed})"
         )
-
-    @staticmethod
-    def _constant(value: object) -> Node:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise FoldError(f"{shorten(str(value))} is not a real number")
-        try:
-            return nodes.number(float(value))
-        except OverflowError:
-            raise FoldError("a number in it is too large") from None
 
 
 _DESCRIBED = {

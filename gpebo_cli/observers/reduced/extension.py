@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -109,7 +109,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
     on_axes &= basis.shape[1] == reduced.first.split.rank  # else they lose what is eliminated
     axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
-    monitor = _Monitor(system, basis, units, axes)
+    monitor = _Monitor(reduced, units, axes)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
     known, signals = None, reduced.signals
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
@@ -136,11 +136,9 @@ class _Monitor:
     has decayed is still measured by the size it had.
     """
 
-    def __init__(
-        self, system: DescriptorSystem, basis: Array, units: Array, axes: Array | None
-    ) -> None:
-        """For coordinates along a basis (n, k), in units (k, 1 + p); axes as of ``kinds``."""
-        self._system, self._basis, self.units, self.axes = system, basis, units, axes
+    def __init__(self, reduced: ReducedSystem, units: Array, axes: Array | None) -> None:
+        """For coordinates in units (k, 1 + p); axes as of ``kinds``."""
+        self._reduced, self.units, self.axes = reduced, units, axes
         self._past: Sequence[Array] = ()
         self._whole: Sequence[Array] = ()
         self.latest: Assembled  # with what stands in front
@@ -156,15 +154,15 @@ class _Monitor:
             ]
         z, *seen = map(_over_time, self._whole)
         self.latest = regression_signals(
-            z, self._system.q, self._basis, AlgebraicEquations(*seen)
+            z, self._reduced.system.q, self._reduced.basis, AlgebraicEquations(*seen)
         )
         if (self.latest.largest / self.units).max(initial=0.0) > _LARGEST:
             raise SolverError(
-                f"the dynamic extension of plant {self._system.name} grows beyond {_LARGEST:.0e}: "
-                "A_0 is unstable; use observer.remedy=output_injection, reset or "
+                f"the dynamic extension of plant {self._reduced.system.name} grows beyond "
+                f"{_LARGEST:.0e}: A_0 is unstable; use observer.remedy=output_injection, reset or "
                 "current_coordinates, or a shorter time.horizon"
             )
-        for signal, floor in self.latest.kinds(self.axes):
+        for signal, floor in self.latest.kinds(self._reduced.form.units.states, self.axes):
             if signal is not None:
                 yield signal.reshape(*self._whole[0].shape[:2], -1), floor
             else:

@@ -35,10 +35,13 @@ class Assembled:
     largest: Array  # (k, 1 + p) sizes of z over time
     moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
 
-    def kinds(self, basis: Array | None = None) -> Iterator[tuple[Any, Any]]:
+    def kinds(
+        self, units: Array | float = 1.0, basis: Array | None = None
+    ) -> Iterator[tuple[Any, Any]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
-        They come one after the other, because all signals of a long recording take much memory.
+        States have ``units`` (n,), in which they are comparable. Signals come one after the other,
+        because all of a long recording take much memory.
         States that are coordinates of z along a ``basis`` of axes are not copied: instead of their
         gain None comes, with the units (k, p) that z without ξ_a is to be measured in.
         """
@@ -63,7 +66,7 @@ class Assembled:
         states = np.maximum(states, 1e-3 * (self.moving / columns).max(axis=1, initial=0.0))
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
-        yield self.offset, 0.0
+        yield self.offset / units, 0.0
         units = np.where(states > 0.0, states, 1.0)[:, None] * columns
         yield gain / units[others], 0.0
         if basis is not None and not others.all():

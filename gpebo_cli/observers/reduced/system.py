@@ -74,6 +74,12 @@ class Formulation:
         return (*self.system.unknowns, *self.begin.names)
 
     @property
+    def parameter_units(self) -> Array:
+        """In which these are comparable, (p,)."""
+        units = self.form.units
+        return np.append(units.unknowns, units_along(self.begin.basis, units.states))
+
+    @property
     def basis(self) -> Array:
         """Coordinates in which w is integrated, (n, k): n_a of them, or n if the kernel rotates."""
         return self.first.split.basis

@@ -55,6 +55,7 @@ class CurrentCoordinates:
         # [ξ_a | ξ_b | Φ] = [0 | 0 | −I] is the identity map from ζ to w.
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
+        units = np.concatenate([reduced.form.units.unknowns, reduced.units])
 
         def evaluate(
             mesh: Mesh
@@ -70,10 +71,12 @@ class CurrentCoordinates:
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 # Further rows 0 = Q w, of the size of ψ.
-                kernel = a.column_scale.max(initial=0.0) * (np.eye(n) - o.split.projector)
+                size = (a.column_scale * units).max(initial=0.0) / reduced.units[:, None]
+                kernel = size * (np.eye(n) - o.split.projector)
                 rows = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
                 a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, rows]))
-            kinds = (*a.kinds(), (A, 0.0), (b, 0.0))
+            own = A * units / units[:, None]
+            kinds = (*a.kinds(reduced.form.units.states), (own, 0.0), (b / units, 0.0))
             signals_of = [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
             return (a, A, b, (o.injectivity, o.elimination)), signals_of
 
@@ -93,7 +96,7 @@ class CurrentCoordinates:
                 psi=mesh.trajectory(final.psi[:, kept]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
                 scale=final.column_scale,
-                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), -2.0 * fastest),
+                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), -2.0 * fastest, units),
             ),
             state_map=AffineStateMap(
                 mesh.trajectory(final.offset), mesh.trajectory(final.gain),

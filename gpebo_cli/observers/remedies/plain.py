@@ -55,7 +55,7 @@ def observation(
         regression=LinearRegression(
             Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),
             parameters=reduced.parameters,
-            scale=extension.scale, resets=resets,
+            scale=extension.scale, resets=resets, units=reduced.parameter_units,
         ),
         state_map=AffineStateMap(*extension.state_map, reduced.form.units.states),
         truth=truth,

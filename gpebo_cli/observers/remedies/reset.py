@@ -25,16 +25,15 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.linalg import largest
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import InitialError, Observation, log_norm
 from gpebo_cli.observers.reduced.extension import Extension, extend, joined
-from gpebo_cli.observers.reduced.split import comparable
+from gpebo_cli.observers.reduced.split import comparable, units_along
 from gpebo_cli.observers.reduced.system import ReducedSystem, Start
 from gpebo_cli.observers.remedies.plain import observation
 from gpebo_cli.regression.linear import outer_products
-from gpebo_cli.regression.resets import ExtensionState, Reset
+from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
 
 _GROWTH = 100.0  # of Φ between resets: two digits
 _TOLERANCE = 1e-6  # of Φ, where only its size matters
@@ -77,10 +76,11 @@ class Resets:
             shown = extensions[-1].assembled
             learned = extensions[-1].mesh.trajectory(outer_products(shown.psi, shown.Y))
             own = learned.integral().final
-            known = ExtensionState(known.values + own, max(known.level, largest(own)))
+            known = ExtensionState(known.values + own, np.maximum(known.level, level_of(own)))
             time = float(mesh.edges[last])
             begin = reduced.start_at(time, float(mesh.inside[last, 0]))
-            reset, xi_a = _restart(reduced, extensions[-1], known, time, begin)
+            units = resets[-1].units if resets else reduced.parameter_units
+            reset, xi_a = _restart(reduced, extensions[-1], known, time, begin, units)
             resets.append(replace(reset, keep=self.keep))
             known = known.after(resets[-1])
             later.append((time, begin.dual, begin.dual @ xi_a))
@@ -95,22 +95,29 @@ class Resets:
 
 
 def _restart(
-    reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, begin: Start
+    reduced: ReducedSystem, extension: Extension, known: ExtensionState, time: float, begin: Start,
+    units: Array | float,
 ) -> tuple[Reset, Array]:
     """T and τ from [ξ_a | ξ_b | Φ] at the end, and ξ_a (n,) where the next segment begins."""
     q, dual = reduced.system.q, begin.dual
     end = reduced.basis @ extension.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
-    eta = np.linalg.pinv(known.values[:, :-1], rcond=_KNOWN, hermitian=True) @ known.values[:, -1]
+    units = np.broadcast_to(units, len(known.values))
+    own = units[:, None] * known.values * np.append(units, 1.0)
+    eta = units * (np.linalg.pinv(own[:, :-1], rcond=_KNOWN, hermitian=True) @ own[:, -1])
     reached = xi_a + xi_b @ eta[:q] - Phi @ eta[q:]
     after = begin.offset + begin.basis @ (dual @ reached)
     p = q + len(dual)
     transform = np.eye(p)
     transform[q:, :q], transform[q:, q:] = -dual @ xi_b, dual @ Phi
     shift = np.concatenate([np.zeros(q), dual @ (after - xi_a)])
-    floor = _FLOOR * max(float(np.abs(part).max(initial=0.0)) for part in (eta[:q], after))
+    of_states, of_unknowns = reduced.form.units.states, reduced.form.units.unknowns
+    floor = _FLOOR * max(
+        float(np.abs(part).max(initial=0.0)) for part in (eta[:q] / of_unknowns, after / of_states)
+    )
+    new = np.append(of_unknowns, units_along(begin.basis, of_states))
     errors = np.concatenate([np.zeros((q, reduced.basis.shape[1])), dual @ reduced.basis])
-    return Reset(time, transform, shift, floor, errors=errors), after
+    return Reset(time, transform, shift, floor, errors=errors, before=units, units=new), after
 
 
 def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
