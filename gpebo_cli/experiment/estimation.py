@@ -443,7 +443,7 @@ def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegressio
     """The regression about some of the parameters, the others being zero, and about which."""
     whole = observation.regression
     if len(columns) in (0, whole.p) or observation.of_constants is None:
-        return whole, np.arange(whole.p)
+        return whole, np.arange(len(observation.parameters))
     return replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
         parameters=tuple(whole.parameters[j] for j in columns),
