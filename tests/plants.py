@@ -10,10 +10,11 @@ import numpy as np
 
 from benchmarks.problems import Problem
 from gpebo_cli.configs import files
+from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import Measurements, observe
-from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 DATA = Path(__file__).parent / "data"
@@ -43,6 +44,14 @@ def problem(path: Path) -> tuple[dict[str, Any], DescriptorSystem]:
     """A published problem: its description and the plant."""
     found = Problem(path.stem, json.loads(path.read_text(encoding="utf-8")))
     return found.data, plant_from_mapping(found.mapping, path.name)
+
+
+def experiment(system, estimator, horizon=20.0, samples=1001, noise=None, **observer):
+    """A run of an observer, of gpebo where no name is given."""
+    return run_experiment(Settings(
+        estimator=estimator, time=TimeSettings(0.0, horizon, samples),
+        observer={"name": "gpebo", **observer}, noise=noise or NoiseSettings(),
+    ), system)  # fmt: skip
 
 
 def seen(signals):

@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import observed, reference, shipped
+from plants import experiment, observed, reference, shipped
 from scipy.linalg import expm
 
 from gpebo_cli.errors import ConfigError, ModelError
-from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.observers.canonical import unknown_input_matrices
-from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import SolverSettings
 
 SOLVER = SolverSettings()
 
 
-def run(system, estimator=None, samples=2001, **observer):
-    settings = Settings(
-        estimator=estimator or {"name": "ls_drem", "gamma": 100.0, "f0": 1e-6},
-        observer={"name": "canonical", **observer},
-        time=TimeSettings(samples=samples),
-    )
-    return run_experiment(settings, system)
+LS_DREM = {"name": "ls_drem", "gamma": 100.0, "f0": 1e-6}
+
+
+def run(system, estimator=LS_DREM, samples=2001, **observer):
+    return experiment(system, estimator, samples=samples, name="canonical", **observer)
 
 
 def test_za_is_recovered():
@@ -113,10 +110,7 @@ def test_regression_identity_with_unknown_parameters():
 
 
 def test_strangeness_free_with_the_general_observer():
-    settings = Settings(
-        estimator={"name": "ls_drem", "gamma": 100.0, "f0": 1e-6}, time=TimeSettings()
-    )
-    result = run_experiment(settings, shipped("strangeness_free"))
+    result = experiment(shipped("strangeness_free"), LS_DREM)
     assert result.simulation.strangeness_index == 0
     assert result.excitation.is_ie
     assert result.metrics.final_error_parameters[0] < 1e-6

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from examples import assert_repeats, gpebo
-from plants import seen, shipped
+from plants import experiment, seen, shipped
 from processes import rows_of
 from test_cli import FAST, folders
 from test_observer import ROTATING
@@ -18,7 +18,6 @@ from test_observer import ROTATING
 from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import examine
-from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
@@ -32,22 +31,15 @@ from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.results.figures import describe
 from gpebo_cli.results.report import estimate_table
-from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
+from gpebo_cli.settings import NoiseSettings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
 
 
 def run(system: DescriptorSystem, horizon: float = 20.0, **more: Any) -> RunResult:
-    noise = more.pop("noise", NoiseSettings())
-    return run_experiment(
-        Settings(
-            estimator=more.pop("estimator", {"name": "drem"}), noise=noise,
-            time=TimeSettings(horizon=horizon, samples=401),
-            observer={"name": "kalman_bucy", **more},
-        ),
-        system,
-    )
+    estimator = more.pop("estimator", {"name": "drem"})
+    return experiment(system, estimator, horizon, 401, **{"name": "kalman_bucy", **more})
 
 
 def assumption(result: RunResult, name: str):

@@ -17,7 +17,7 @@ import yaml
 from examples import assert_repeats, gpebo
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import shipped
+from plants import experiment, shipped
 from processes import assert_refused, refused, write_table
 from scipy.io import savemat
 
@@ -47,10 +47,7 @@ def signals_of(result):
 
 
 def simulated(name="circuit", samples=1001, horizon=20.0):
-    return run_experiment(
-        Settings(estimator=ESTIMATOR, time=TimeSettings(0.0, horizon, samples)),
-        shipped(name),
-    )
+    return experiment(shipped(name), ESTIMATOR, horizon, samples)
 
 
 def recorded(path, name="circuit", hold="linear", time=WHOLE, **more):

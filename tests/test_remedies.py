@@ -12,7 +12,7 @@ import yaml
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import left_of_identities, shipped
+from plants import experiment, left_of_identities, shipped
 from plants import observed as along
 from processes import assert_refused, refused
 from regressions import ETA, three
@@ -56,14 +56,8 @@ WITH_UNKNOWN = {**UNBOUNDED, "unknowns": {"theta": 0.7}, "F": [[0], [0], [1], [0
 
 
 def run(mapping, horizon=40.0, estimator=None, samples=401, **observer):
-    return run_experiment(
-        Settings(
-            estimator=estimator or {"name": "least_squares"},
-            time=TimeSettings(horizon=horizon, samples=samples),
-            observer={"name": "gpebo", **observer},
-        ),
-        plant_from_mapping(mapping) if isinstance(mapping, dict) else mapping,
-    )
+    system = plant_from_mapping(mapping) if isinstance(mapping, dict) else mapping
+    return experiment(system, estimator or {"name": "least_squares"}, horizon, samples, **observer)
 
 
 def relative_error(result, case=0):

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import shipped
+from plants import experiment, shipped
 from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
@@ -33,11 +33,7 @@ RNG = np.random.default_rng(7)
 
 
 def run(system, estimator, horizon=5.0, **observer):
-    settings = Settings(
-        estimator=estimator, time=TimeSettings(0.0, horizon, 2001),
-        observer={"name": "gpebo", **observer},
-    )
-    return run_experiment(settings, system)
+    return experiment(system, estimator, horizon, 2001, **observer)
 
 
 def signals(system, t):
