@@ -104,7 +104,7 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
     [
         ({"E": np.eye(5)}, r"E has shape \(5, 5\), expected \(6, 6\)"),
         ({"u": None}, "B and u go together"),
-        ({"names": Names(states=("a", "b"))}, "2 names given for 6"),
+        ({"names": Names(states=("a", "b"))}, "2 names of states for 6 of them"),
         ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(1, 5, 6\)"),
         ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1"),
     ],

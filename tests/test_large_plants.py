@@ -225,7 +225,7 @@ def test_kicks_are_added_at_right_ends():
     rng, mesh = np.random.default_rng(0), Mesh(np.linspace(0.0, 1.0, 4), radau_rule(4))
     A, kicks, start = (rng.normal(size=shape) for shape in ((3, 3), (3, 3, 2), (3, 2)))
     matrix = series.Sparse(np.array([0, 3, 6, 9]), np.tile(np.arange(3), 3), A.reshape(1, 9))
-    values, _ = series._Solved(matrix)(mesh, matrix, np.zeros((1, 3, 0)), kicks, start, 1e-9)
+    values, _ = series.by_factors(matrix)(mesh, matrix, np.zeros((1, 3, 0)), kicks, start, 1e-9)
     np.testing.assert_allclose(values[1:, 0], (values[:, -1] + kicks)[:-1], rtol=1e-12)
     np.testing.assert_allclose(values[0, -1], expm(A / 3.0) @ start, rtol=1e-6)
 

@@ -449,4 +449,5 @@ def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegressio
         parameters=tuple(whole.parameters[j] for j in columns),
         factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
         scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],
+        units=np.broadcast_to(whole.units, whole.p)[columns],
     ), columns

@@ -19,6 +19,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.model.archive import MAX_BYTES, read_archive, read_mat
 from gpebo_cli.model.entries import is_sparse
+from gpebo_cli.model.functions import names_of
 from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown
 
@@ -63,14 +64,14 @@ def from_matrices(
             )
     draft = PlantDraft(name, title or f"matrices {name}", reference)
     start = np.zeros(n) if initial_state is None else np.asarray(initial_state, dtype=float)
-    labels = _labels("states", states, "x", n, name)
+    labels = names_of("states", states, "x", n, name)
     if start.shape != (n,):
         raise ConfigError(f"plant {name}: initial_state has {start.size} values for {n} states")
     draft.states.update({s: (float(v), "") for s, v in zip(labels, start, strict=True)})
     signals = inputs if isinstance(inputs, Mapping) else {}
-    columns = _labels("inputs", None if inputs is None else list(inputs), "u", m, name)
+    columns = names_of("inputs", None if inputs is None else list(inputs), "u", m, name)
     draft.inputs.update({u: (signals.get(u, 0.0), "") for u in columns})
-    draft.outputs.update(dict.fromkeys(_labels("outputs", outputs, "y", r, name), ""))
+    draft.outputs.update(dict.fromkeys(names_of("outputs", outputs, "y", r, name), ""))
     for i in range(n):
         draft.equation(f"equation {i + 1}")
     draft.add_matrix("E", given.get("E", np.eye(n)))
@@ -217,16 +218,6 @@ def _identifier(text: str) -> str:
     """A name that can stand in a plant: other characters become _."""
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
     return name if name and not name[0].isdigit() else f"x_{name}"
-
-
-def _labels(
-    kind: str, names: Sequence[str] | None, letter: str, count: int, plant: str
-) -> list[str]:
-    if names is None:
-        return [f"{letter}{i + 1}" for i in range(count)]
-    if len(names) != count:
-        raise ConfigError(f"plant {plant}: {len(names)} names of {kind} for {count} of them")
-    return list(names)
 
 
 def _real(key: str, value: Any, plant: str) -> Any:

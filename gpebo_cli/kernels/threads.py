@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import cache, wraps
 from typing import Any, TypeVar, cast
 
@@ -22,9 +23,7 @@ def one_thread(work: _Work) -> _Work:
 
     @wraps(work)
     def limited(settings: Any, system: Any, *args: Any, **kwargs: Any) -> Any:
-        if system.n > _LARGE:
-            return work(settings, system, *args, **kwargs)
-        with single():
+        with nullcontext() if system.n > _LARGE else single():
             return work(settings, system, *args, **kwargs)
 
     return cast(_Work, limited)

@@ -282,7 +282,8 @@ def system_from_functions(
     r = len(names.outputs) or _rows(C, m)
     if (u is None) != (B is None):
         raise ConfigError(f"plant {name}: B and u go together; one of them is missing")
-    inputs, outputs = _labels(names.inputs, "u", m, name), _labels(names.outputs, "y", r, name)
+    inputs = names_of("inputs", names.inputs, "u", m, name)
+    outputs = names_of("outputs", names.outputs, "y", r, name)
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
     signals: dict[str, frozenset[str]] = {}
@@ -329,9 +330,9 @@ def system_from_functions(
         ),
         initial_state=x0,
         theta=fixed.get("theta", np.full(q, np.nan)),
-        states=_labels(names.states, "x", n, name),
+        states=names_of("states", names.states, "x", n, name),
         inputs=inputs,
-        unknowns=_labels(names.unknowns, "theta", q, name),
+        unknowns=names_of("unknowns", names.unknowns, "theta", q, name),
         outputs=outputs,
     )
 
@@ -356,7 +357,10 @@ def _rows(entry: Entry | None, inputs: int = 0) -> int:
     return 0 if first is None else len(np.asarray(first))
 
 
-def _labels(given: Sequence[str], letter: str, count: int, plant: str) -> tuple[str, ...]:
+def names_of(
+    kind: str, given: Sequence[str] | None, letter: str, count: int, plant: str
+) -> tuple[str, ...]:
+    """The ``given`` names, or x1, x2, … (ConfigError: there are not ``count`` of them)."""
     if given and len(given) != count:
-        raise ConfigError(f"plant {plant}: {len(given)} names given for {count} of {letter}1 …")
+        raise ConfigError(f"plant {plant}: {len(given)} names of {kind} for {count} of them")
     return tuple(given) if given else tuple(f"{letter}{i + 1}" for i in range(count))

@@ -70,8 +70,8 @@ def plant_from_mapping(
     states = _names(plant, "states", _required(mapping, "states", plant))
     if not states and kind == "plant":
         raise ConfigError(f"{plant}: states is empty; a plant has at least one state")
-    inputs = _named_values(plant, "inputs", mapping.get("inputs"), "{V: sin(t)}")
-    unknowns = _named_values(plant, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
+    inputs = named_values(plant, "inputs", mapping.get("inputs"), "{V: sin(t)}")
+    unknowns = named_values(plant, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
     outputs = _names(plant, "outputs", mapping.get("outputs"))
     kinds = {
         "a state": states,
@@ -247,7 +247,8 @@ def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
     return tuple(_name(plant, key, item) for item in items)
 
 
-def _named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
+def named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
+    """What a key of a file has by name, in its order (ConfigError: no mapping, or no names)."""
     if value is None or value == []:
         return {}
     if not isinstance(value, Mapping):
@@ -277,7 +278,7 @@ def read_parameters(
     Inputs and outputs are ``signals``; names that may not be used are ``elsewhere``, with what they
     are (ConfigError: a value that is no expression of the language, or a name that cannot be one).
     """
-    given = _named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
+    given = named_values(plant, "parameters", value, "{R: 2 + sin(t)}")
     if len(given) > _MAX_PARAMETERS:
         raise ConfigError(f"{plant}: {len(given)} parameters; at most {_MAX_PARAMETERS} are read")
     parameters: dict[str, Expression] = {}

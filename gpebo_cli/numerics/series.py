@@ -134,10 +134,8 @@ def solve(
     A, _, _ = equation(mesh)
     march: March = partial(_series, 1.0 / units)
     if stiff:
-        full = len(A.columns) > _DENSE * len(A.rows) ** 2
-        if full and len(A.entries) > 1:
-            return None
-        march = _Solved(A) if full else by_elimination
+        full = len(A.entries) == 1 and len(A.columns) > _DENSE * len(A.rows) ** 2
+        march = by_factors(A) if full else by_elimination
     else:
         parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh.size), units) / LENGTH)
         if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
@@ -186,19 +184,16 @@ def solve_dense(
 
     ``f`` may be of the first columns only. None also where too few entries are zero.
     """
-    last: list[tuple[Mesh, Equation]] = []
+    first = mesh
 
+    @lru_cache(maxsize=1)
     def equation(mesh: Mesh) -> Equation:
-        if not last or last[0][0] is not mesh:
-            c = known if known is not None and not last else problem.coefficients(
-                mesh.points.ravel(), mesh.inside.ravel()
-            )
-            A = sparse(c.A)
-            if A is None:
-                raise StiffError
-            extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
-            last[:] = [(mesh, (A, c.f, extras))]
-        return last[0][1]
+        c = known if mesh is first else None
+        c = c or problem.coefficients(mesh.points.ravel(), mesh.inside.ravel())
+        A = sparse(c.A)
+        if A is None:
+            raise StiffError
+        return A, c.f, tuple(at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
 
     try:
         return solve(
@@ -295,14 +290,21 @@ def _legendre_powers(degrees: int, parts: int) -> Array:
     return np.array(each).transpose(2, 0, 1)
 
 
-class _Solved:
+def by_factors(A: Sparse) -> March:
     """A march for one constant A, by solving (D/h ⊗ I − I ⊗ A) X = D𝟙/h x_0 + f."""
+    from scipy.linalg import lu_factor, lu_solve
 
-    def __init__(self, A: Sparse) -> None:
-        self._A, self._factors = A.full()[0], dict[str, tuple[ComplexArray, IntArray]]()
+    full, factors = A.full()[0], dict[str, Any]()
 
-    def __call__(
-        self, mesh: Mesh, _: Sparse, f: Array, kicks: Array | None, start: Array, _tol: float
+    def solved(shift: complex, right: ComplexArray) -> ComplexArray:
+        """(shift I − A) y = r, with one factorisation for what is equal but for rounding."""
+        known = f"{shift:.13e}"
+        if known not in factors:
+            factors[known] = lu_factor(shift * np.eye(len(full)) - full, overwrite_a=True)
+        return np.asarray(lu_solve(factors[known], right, check_finite=False), np.complex128)
+
+    def march(
+        mesh: Mesh, _: Sparse, f: Array, kicks: Array | None, start: Array, _tol: float
     ) -> tuple[Array, Array]:
         s, (d, columns) = mesh.rule.stages, start.shape
         from_left = mesh.rule.differentiation.sum(axis=1)[:, None, None]
@@ -311,20 +313,11 @@ class _Solved:
             right = np.broadcast_to(from_left / step * state, (s, d, columns)).copy()
             points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
             right[:, :, : f.shape[2]] += f if len(f) == 1 else f[points]
-            values[k, 0], values[k, 1:] = state, decoupled(s, step, right, self._solve)
+            values[k, 0], values[k, 1:] = state, decoupled(s, step, right, solved)
             state = values[k, -1] if kicks is None else values[k, -1] + kicks[k]
         return values, np.zeros(mesh.size)
 
-    def _solve(self, shift: complex, right: ComplexArray) -> ComplexArray:
-        """(shift I − A) y = r, with one factorisation for what is equal but for rounding."""
-        from scipy.linalg import lu_factor, lu_solve
-
-        known = f"{shift:.13e}"
-        if known not in self._factors:
-            matrix = shift * np.eye(len(self._A)) - self._A
-            self._factors[known] = lu_factor(matrix, overwrite_a=True)
-        solved = lu_solve(self._factors[known], right, check_finite=False)
-        return np.asarray(solved, dtype=np.complex128)
+    return march
 
 
 def _terms(

@@ -31,7 +31,7 @@ def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     because E has full column rank on the kernel of A2; NaN where numbers are so large or so small
     that it has not. A state that satisfies the constraints to rounding is returned as it is.
     """
-    if form.basis is None or form.offset is None:
+    if not form.A2.shape[1]:
         return x0.copy()
     E, E1, T, offset = form.E[0], form.E1[0], form.basis[0], form.offset[0]
     size = np.abs(x0)
@@ -129,10 +129,8 @@ def jumps(
                     "impulse or a jump of its own, and their product is undefined; take the "
                     "conserved quantity (charge, momentum) as the state"
                 )
-        state = before + w[0]
-        if form.basis is not None and form.offset is not None:
-            # On the constraints to the last digit: a component that they make zero is zero.
-            state = at(form.basis, k) @ (at(form.E1, k) @ state) + form.offset[k]
+        # On the constraints to the last digit: a component that they make zero is zero.
+        state = at(form.basis, k) @ (at(form.E1, k) @ (before + w[0])) + form.offset[k]
         return Jump(state, impulses)
 
     return jump

@@ -39,8 +39,8 @@ def forcing(c: Coefficients) -> Array:
 class StrangenessFree:
     """E1 x' = A1 x + f1 (d rows) and 0 = A2 x + f2 (a rows) at N times.
 
-    Where there are constraints, the consistent states are x = T z + offset with z = E1 x. The
-    matrices have a leading axis of 1 when E and A are constant.
+    The consistent states are x = T z + offset with z = E1 x. The matrices have a leading axis of 1
+    when E and A are constant.
     """
 
     E1: Array  # (N or 1, d, n)
@@ -48,8 +48,8 @@ class StrangenessFree:
     f1: Array  # (N, d)
     A2: Array  # (N or 1, a, n)
     f2: Array  # (N, a)
-    basis: Array | None  # (N, n, d) T, of the kernel of A2, with E1 T = I; None if a = 0
-    offset: Array | None  # (N, n)
+    basis: Array  # (N or 1, n, d) T, of the kernel of A2, with E1 T = I
+    offset: Array  # (N, n)
     # By how much relative rounding of each state and of f2 reaches each state through the
     # constraints, the most at some of the times.
     amplification: Array  # (n, n + 1)
@@ -96,10 +96,8 @@ def strangeness_free_form(
             *model[:2], every,
         )
     E1, A1, f1, A2, f2, basis, offset, amplification = found
-    none = not structure.a
     return StrangenessFree(
-        E1, A1, f1, A2, f2, None if none else basis, None if none else offset, amplification,
-        E[0], c.u[0], distinct(c.C)[0], direct,
+        E1, A1, f1, A2, f2, basis, offset, amplification, E[0], c.u[0], distinct(c.C)[0], direct
     )
 
 

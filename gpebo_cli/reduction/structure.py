@@ -78,7 +78,7 @@ class Structure:
     @property
     def growth(self) -> float:
         """Largest real part of its eigenvalues at the probes, 1/s, or zero."""
-        return 0.0 if self.dynamics is None else float(_growth(self.dynamics).max())
+        return 0.0 if self.dynamics is None else float(growth_rates(self.dynamics).max())
 
 
 def without_equations() -> Structure:
@@ -96,13 +96,8 @@ def who(system: DescriptorSystem) -> str:
     return f"plant {system.name}" + (f" ({system.source})" if system.source else "")
 
 
-def growth_rates(E1: Array, A1: Array, basis: Array | None) -> Array:
-    """Largest real part (N,) of the eigenvalues of z' = A1 T z, E1 T = I, or zero, in 1/s."""
-    return _growth(np.asarray(np.linalg.solve(E1, A1) if basis is None else A1 @ basis))
-
-
-def _growth(matrices: Array) -> Array:
-    """Largest real parts (N,) of the eigenvalues of matrices (N, d, d), or zero."""
+def growth_rates(matrices: Array) -> Array:
+    """Largest real parts (N,) of the eigenvalues of matrices (N, d, d) in 1/s, or zero."""
     return np.asarray(np.linalg.eigvals(matrices).real.max(axis=1, initial=0.0))
 
 

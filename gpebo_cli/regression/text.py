@@ -38,7 +38,7 @@ from gpebo_cli.model.expressions import (
 from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.expressions.tape import UNKNOWN
-from gpebo_cli.model.plant import plant_from_mapping, read_parameters
+from gpebo_cli.model.plant import named_values, plant_from_mapping, read_parameters
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -308,7 +308,10 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         mapping, right, outputs = {**mapping, "Y": None}, None, measured
     recorded = tuple(name for name, value in signals.items() if value is None)
     signals = {name: 0 if value is None else value for name, value in signals.items()}
-    parametrisation, own = _parametrisation(mapping, len(signals), count, where)
+    unknowns = named_values(where, "unknowns", mapping.get("unknowns"), "{theta1: 1.5}")
+    if not unknowns:
+        raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
+    parametrisation, own = _parametrisation(mapping, unknowns, len(signals), count, where)
     system = plant_from_mapping(
         {
             "states": [], "E": [], "A": [], "initial_state": [],
@@ -319,8 +322,6 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         },
         source, "regression",
     )
-    if not system.unknowns:
-        raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
     named = {name: signal(name, k, "a signal") for k, name in enumerate(system.inputs)}
     elsewhere = dict.fromkeys((*system.unknowns, *system.states), "an unknown")
     known = named | read_parameters(where, mapping.get("parameters"), named, elsewhere)
@@ -362,17 +363,15 @@ def _measured(mapping: Mapping[str, object], signals: Mapping[str, object]) -> l
 
 
 def _parametrisation(
-    mapping: Mapping[str, object], inputs: int, rows: int, where: str
+    mapping: Mapping[str, object], unknowns: Mapping[str, object], inputs: int, rows: int,
+    where: str,
 ) -> tuple[Parametrisation | None, dict[str, object]]:
     """S on its box, and the keys of a system whose states are θ, which do not move: θ' = 0."""
     if mapping.get("S") is None:
         if mapping.get("box") is not None:
             raise ConfigError(f"{where}: box is for S, and there is none")
         return None, {}
-    unknowns = mapping.get("unknowns")
-    if not isinstance(unknowns, Mapping) or not unknowns:
-        raise ConfigError(f"{where}: unknowns is missing; it maps each parameter to its true value")
-    names = tuple(map(str, unknowns))
+    names = tuple(unknowns)
     truth = np.array([number(unknowns[k], f"{where}: unknowns.{k}", "finite") for k in names])
     low, high = read_box(mapping.get("box"), names, where)
     for name, value, ends in zip(names, truth.tolist(), zip(low, high, strict=True), strict=True):

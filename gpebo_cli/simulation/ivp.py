@@ -15,16 +15,20 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.structure_numpy import derivative_array, scaled
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.reduction.strangeness_free import forcing
 from gpebo_cli.reduction.structure import Structure
 
-_MAX_ROUNDS = 12
+_COARSER = 1e3  # times the tolerance, to which the mesh resolves: dense output is of lower order
 _LOOK, _MOST = 2000, 200_000  # evaluations: after the first it is known whether more are needed
+
+
+_Found = tuple[Array, tuple[Array, ...]]  # values, and what the monitor needs
 
 
 def underlying_ode(
@@ -85,29 +89,28 @@ def solve(
 
     SolverError: solve_ivp gave up, or the mesh cannot resolve the result.
     """
-    for _ in range(_MAX_ROUNDS):
+    plain = replace(problem, units=None)
+
+    def evaluate(mesh: Mesh, _: object, kept: IntArray) -> tuple[_Found, Array]:  # noqa: ARG001
         values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
         sizes = largest_over_time(values, 2)
-        plain = replace(problem, units=None)
         tail = unresolved_signals(plain, mesh.rule, values, extras, sizes, tol)
-        poor = tail > 1e3 * tol  # its dense output is of lower order than its steps
-        if not poor.any():
-            # What a looser tolerance changes tells how far errors of steps have grown.
-            rough = _sample(problem, mesh, max(10.0 * tol, 1e-12), restarts or {})
-            beside = np.maximum(sizes, 1e-9 * sizes.max(initial=1e-100))
-            errors = largest_over_time(values - rough, 2) / beside
-            errors = np.maximum(errors, max(tail.max(initial=0.0), 1e2 * tol))
-            estimate = float(errors.max(initial=1e2 * tol))
-            return LinearSolution(Trajectory(mesh, values), estimate, errors, None, extras)
-        if mesh.size + poor.sum() > max_elements:
-            break
-        mesh, _ = mesh.split(np.where(poor, 2, 1))
-    raise SolverError(
-        f"solver=ivp: the {problem.name} is not resolved to {tol:.1e} near "
-        f"t = {mesh.edges[int(np.argmax(tail))]:.6g}; loosen solver.tol or use solver=collocation"
+        return (values, extras), tail
+
+    mesh, (values, extras), tail = refine(
+        evaluate, mesh, tol=_COARSER * tol, max_elements=max_elements,
+        name=f"{problem.name} (solver=ivp)",
     )
+    # What a looser tolerance changes tells how far errors of steps have grown.
+    rough = _sample(problem, mesh, max(10.0 * tol, 1e-12), restarts or {})
+    sizes = largest_over_time(values, 2)
+    beside = np.maximum(sizes, 1e-9 * sizes.max(initial=1e-100))
+    errors = largest_over_time(values - rough, 2) / beside
+    errors = np.maximum(errors, max(tail.max(initial=0.0), 1e2 * tol))
+    estimate = float(errors.max(initial=1e2 * tol))
+    return LinearSolution(Trajectory(mesh, values), estimate, errors, None, extras)
 
 
 def _sample(

@@ -140,16 +140,10 @@ def _window(
         passed = along.switched if len(along.switched) else passed  # one iterate may, the next not
         linear = replace(system, coefficients=along)
         own = solver if full else replace(solver, tol=_LOOSE)
-        alike = count > 2 and full == was_full
-        if alike:  # what makes so many more of them at one tolerance does not converge
+        if count > 2 and full == was_full:  # many more of them at one tolerance do not converge
             most = max(_FEW_ELEMENTS, _MORE_ELEMENTS * guess.mesh.size)
             own = replace(own, max_elements=min(own.max_elements, most))
-        try:
-            found = solve(linear, time, own, _MOST_GROWTH / time.horizon)
-        except SolverError:
-            if alike:
-                break
-            raise
+        found = solve(linear, time, own, _MOST_GROWTH / time.horizon)
         if found is None:
             break
         work += 1.0 if full else np.log(_LOOSE) / np.log(solver.tol)

@@ -14,7 +14,7 @@ from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, ch
 from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
-from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.refinement import RoundingError
@@ -155,7 +155,7 @@ def _solved(
 
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
     floor = SHARE * np.abs(system.initial_state)
-    if first.basis is not None:
+    if structure.a:
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
     def missed(mesh: Mesh, values: Array) -> Array:
         some = slice(None, None, -(-mesh.size // _LOOKED_AT))
@@ -244,7 +244,7 @@ def _growth_resolved(
         length = (mesh.edges[-1] - mesh.edges[0]) / _LOOKED_AT_FOR_GROWTH
         mesh, _ = mesh.split(np.ceil(mesh.steps / length).astype(np.intp))
         form = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel())
-        rates = np.broadcast_to(growth_rates(form.E1, form.A1, form.basis), mesh.points.size)
+        rates = np.broadcast_to(growth_rates(form.A1 @ form.basis), mesh.points.size)
         rates = rates.reshape(mesh.points.shape).max(axis=1)
         parts = np.maximum(1.0, np.ceil(mesh.steps * (rates / SHORT)))
         if parts.sum() > most:
@@ -267,13 +267,8 @@ def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
     """
     some = slice(None, None, max(1, len(form.E1) // _LOOKED_AT))
     E1, A1 = form.E1[some], form.A1[some if len(form.A1) > 1 else slice(None)]
-    if form.basis is None:
-        T, singular = inverse_or_none(E1)
-        T[singular] = 0.0
-    else:
-        T = form.basis[some]
     found = form.amplification.copy()
-    T, E1 = np.abs(T), np.abs(E1)
+    T, E1 = np.abs(form.basis[some]), np.abs(E1)
     sizes = T / units[:, None] * (E1 @ units)[:, None]
     rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), T, T / EPS)
     found[:, :-1] += (rounding @ E1).max(axis=0)
@@ -286,7 +281,7 @@ def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
     extras = tuple(e for e in (reduced.u, reduced.C, reduced.direct) if e is not None)
     f1 = reduced.f1[:, :, None]
-    if reduced.basis is None or reduced.offset is None:
+    if not reduced.A2.shape[1]:
         return LinearEquation(reduced.E1, reduced.A1, f1, extras)
     constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
     return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
