@@ -20,6 +20,7 @@ from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, build, gpebo
+from gpebo_cli.observers._base import SignalNoise
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.observers.reduced import system as reduced
 from gpebo_cli.recordings.hold import held, recording_mesh
@@ -97,6 +98,38 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
     np.testing.assert_allclose(windows / size, whole / size, rtol=0.0, atol=1e-8)
     found = [each.regression.error_estimate for each in results]
     assert found[0] / 10 < found[1] < 10 * found[0]
+
+
+def test_a_long_filter_runs_window_by_window(monkeypatch):
+    """The Kalman-Bucy filter of a window goes on where the one before has ended."""
+    made = run("descriptor", observer="none", time={"horizon": 6.0, "samples": 151})
+    names, rng = [*made.inputs, *made.outputs], np.random.default_rng(0)
+    data = {"t": made.t, **{name: made[name] + 0.01 * rng.standard_normal(151) for name in names}}
+    found = []
+    for window in (10**6, 16):
+        monkeypatch.setattr(mesh, "_WINDOW", window)
+        found.append(run("descriptor", data=data, observer="kalman_bucy", time={"samples": 31}))
+    whole, windows = (each.details.estimation for each in found)
+    for name in ("parameters", "states", "parameters_std", "states_std"):
+        np.testing.assert_allclose(getattr(windows, name), getattr(whole, name), rtol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["descriptor", "steps"])
+def test_a_filter_runs_on_long_elements_and_follows_every_sample(name):
+    """Its P does not depend on signals that no long element resolves, and ζ̂ is linear in them."""
+    system = plant_from_mapping(PLANTS[name], name) if name in PLANTS else shipped(name)
+    signals, wanted = rough(system, "linear", rows=300), np.linspace(0.0, 4.0, 23)
+    noise = SignalNoise(np.full(system.m, 0.1), np.full(system.r, 0.3), 0.01)
+    whole, few = (
+        build({"name": "kalman_bucy"}).observe(system, each, SolverSettings()).state_map
+        for each in (replace(signals, noise=noise), replace(signals, noise=noise, wanted=wanted))
+    )
+    assert few.filtered.mesh.size < whole.filtered.mesh.size / 3
+    for one, other in zip(few.filtered.at(wanted), whole.filtered.at(wanted), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-7, atol=1e-8 * np.abs(other).max())
+    for part in ("offset", "gain"):
+        found, expected = (getattr(each.affine, part)(wanted) for each in (few, whole))
+        np.testing.assert_allclose(found, expected, atol=1e-8 * np.abs(expected).max())
 
 
 def test_windows_measure_what_has_decayed_by_the_size_it_had(monkeypatch):
@@ -185,9 +218,10 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
                        r"time.horizon=20.8 fits, and .* \(data.file=- < FILE\)$"):
         run("battery", data=data)
     run("battery", data=data, time={"horizon": 20.5})
-    # The filter holds more, and so do several files together.
+    # The filter holds more where all of it is compared, and so do several files together.
+    known = {**data, "v1": 0.0 * t}
     with pytest.raises(ConfigError, match=r"time\.horizon=2.98 fits"):
-        run("battery", data=data, observer="kalman_bucy", time={"horizon": 20.5})
+        run("battery", data=known, observer="kalman_bucy", time={"horizon": 20.5})
     table = np.column_stack([data["t"], data["current"], data["v"]])[:1026]
     files = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
     for file in files:

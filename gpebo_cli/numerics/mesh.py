@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from math import factorial, prod
@@ -131,6 +131,11 @@ class Mesh:
             return [self]
         cuts = range(0, self.size, _WINDOW)
         return [replace(self, edges=self.edges[k : k + _WINDOW + 1]) for k in cuts]
+
+    def shares(self, t: Array) -> Iterator[Array]:
+        """Those of the times t (M,), ascending, that are in each of :meth:`windows`."""
+        starts = self.origin + self.edges[:-1:_WINDOW][: len(self.windows())]
+        yield from np.split(t, t.searchsorted(starts[1:]))
 
     def split(self, parts: IntArray) -> tuple[Mesh, IntArray]:
         """Cut element k into ``parts[k]`` equal ones; ``parts`` has shape (K,).

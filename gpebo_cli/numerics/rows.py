@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 
 PAUSE = 5.0  # times the median step: a longer one
 
@@ -27,8 +27,13 @@ class Rows(NamedTuple):
 
         What lines make of an error beside a time has a part in the steps on both sides.
         """
-        step = np.diff(self.t)
-        if self.lines:
-            wide = np.pad(step, 1, mode="edge")
-            step = 0.25 * (wide[:-2] + 2.0 * step + wide[2:])
-        return np.asarray(step[np.searchsorted(self.t, t, side="right").clip(1, len(step)) - 1])
+        row = np.searchsorted(self.t, t, side="right") - 1
+
+        def steps(row: IntArray) -> Array:
+            k = row.clip(0, len(self.t) - 2)
+            return np.asarray(self.t[k + 1] - self.t[k])
+
+        if not self.lines:
+            return steps(row)
+        row = row.clip(0, len(self.t) - 2)
+        return 0.25 * (steps(row - 1) + 2.0 * steps(row) + steps(row + 1))

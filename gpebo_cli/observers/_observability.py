@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -23,6 +23,7 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 
 _WINDOWS = 10  # to a horizon
+_STARTS = 1000  # of windows, about: of more elements several are taken as one
 _STAGES = 6  # at least: products that begin anew in every element look rough to fewer
 
 
@@ -39,7 +40,7 @@ def window_gramians(
     model: Callable[[Array, Array], tuple[Array, Array]], n: int, mesh: Mesh, *, tol: float,
     max_elements: int,
 ) -> WindowGramians:
-    """M over windows of a tenth of the horizon, from every edge that leaves room for one.
+    """M over windows of a tenth of the horizon, from every edge that leaves room for one, or some.
 
     ``model`` gives A and W (N, n, n) at times (N,); ``tol`` is relative to the size of Ψ and of
     what is integrated.
@@ -60,20 +61,31 @@ def window_gramians(
         coefficients, np.eye(n), monitor, "observability Gramian",
         renewal=lambda reached: np.eye(len(reached)),
     )
+    span, together = mesh.span, -(-mesh.size // _STARTS)
     mesh = replace(mesh, rule=radau_rule(max(mesh.rule.stages, _STAGES)))
-    solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
-    mesh, values = solution.trajectory.mesh, solution.trajectory.values
-    local = Trajectory(mesh, products(values, solution.extras)).integral(local=True).values[:, -1]
-    return _sum_windows(mesh, values[:, -1], local)
+    found: list[tuple[Array, Array, Array]] = []
+    for part in mesh.windows():
+        solution = solve(problem, part, tol=tol, max_elements=max_elements)
+        own, values = solution.trajectory.mesh, solution.trajectory.values
+        weighed = Trajectory(own, products(values, solution.extras))
+        local = weighed.integral(local=True).values[:, -1]
+        first = np.arange(0, own.size, together)
+        after = np.minimum(first + together, own.size)
+        found.append((own.points[first, 0], *_summed(values[:, -1], local, first, after)))
+    starts, transition, local = map(np.concatenate, zip(*found, strict=True))
+    window = (span[1] - span[0]) / _WINDOWS
+    ends, slack = np.append(starts, span[1]), 1e-9 * window
+    first = np.flatnonzero(starts + window <= span[1] + slack)
+    after = np.searchsorted(ends, starts[first] + window - slack)  # the edge that ends the window
+    return WindowGramians(
+        starts[first], _summed(transition, local, first, after)[1], window
+    )
 
 
-def _sum_windows(mesh: Mesh, transition: Array, local: Array) -> WindowGramians:
-    """M of all windows from Ψ over each element and its own integral, (K, n, n) each."""
-    edges = mesh.edges
-    window = float(edges[-1] - edges[0]) / _WINDOWS
-    slack = 1e-9 * window
-    first = np.flatnonzero(edges[:-1] + window <= edges[-1] + slack)
-    after = np.searchsorted(edges, edges[first] + window - slack)  # the edge that ends the window
+def _summed(
+    transition: Array, local: Array, first: IntArray, after: IntArray
+) -> tuple[Array, Array]:
+    """Ψ and M (W, n, n) over elements ``first`` to ``after`` (W,), from those of each (K, n, n)."""
     n = local.shape[-1]
     gramians = np.zeros((len(first), n, n))
     reached = np.broadcast_to(np.eye(n), gramians.shape).copy()
@@ -82,4 +94,4 @@ def _sum_windows(mesh: Mesh, transition: Array, local: Array) -> WindowGramians:
         k = first[on] + step
         gramians[on] += transpose(reached[on]) @ local[k] @ reached[on]
         reached[on] = transition[k] @ reached[on]
-    return WindowGramians(mesh.points[first, 0], gramians, window)
+    return reached, gramians

@@ -23,9 +23,9 @@ what is chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁�
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory, signal_scale
+from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, signal_scale
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
 from gpebo_cli.numerics.radau import radau_rule
 
@@ -44,7 +44,7 @@ _SMALLEST = 3e-5
 _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
 _UNSEEN = 1e-12  # of P, by which measurements change it over the horizon: as much as none
 _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
-_STAGES = 8  # at least: P falls fast from where it starts, whatever a recording's mesh was made for
+_STAGES = 8  # at least, at first: P falls fast from where it starts, whatever a mesh was made for
 _GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
 
 
@@ -123,7 +123,9 @@ class Filtered:
     variance: float  # of P
     unit: Array  # (n,) of ζ
     error_estimate: float  # relative to each signal's own size
-    extras: tuple[Array, ...]  # of the coefficients, (K, s + 1, …) each
+    extras: tuple[Trajectory, ...]  # of the coefficients
+    tol: float = 0.0  # with which it was resolved
+    sizes: tuple[Array, ...] = ()  # (c,) so far of ζ̂ in those units, and of what follows it
 
     @property
     def mesh(self) -> Mesh:
@@ -137,10 +139,28 @@ class Filtered:
         return self.variance * unit * P * self.unit, unit * estimate
 
 
+Model = Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]]
+
+
+def filter_windows(
+    model: Model, start: Array, P0: Array, windows: Sequence[Mesh], **settings: Any
+) -> Iterator[Filtered]:
+    """:func:`run_filter` on one window after the other, from ζ̂ = ``start`` (n, g) with P0 (n, n).
+
+    What one of them holds does not have to be held for the next.
+    """
+    before: Filtered | None = None
+    horizon = windows[-1].span[1] - windows[0].span[0]
+    for window in windows:
+        before = run_filter(model, start, P0, window, horizon=horizon, before=before, **settings)
+        yield before
+
+
 def run_filter(
-    model: Callable[[Array, Array], tuple[StateSpace, tuple[Array, ...]]], start: Array, P0: Array,
-    mesh: Mesh, *, tol: float, max_elements: int, monitor: Monitor | None = None,
-    name: str = "Kalman-Bucy filter", floor: Array | float = 0.0, sizes: Array | float = 1.0,
+    model: Model, start: Array, P0: Array, mesh: Mesh, *, tol: float, max_elements: int,
+    monitor: Monitor | None = None, name: str = "Kalman-Bucy filter",
+    floor: Array | float = 0.0, sizes: Array | float = 1.0, horizon: float | None = None,
+    before: Filtered | None = None,
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 
@@ -148,27 +168,18 @@ def run_filter(
     whatever ``monitor`` needs, which gives further signals to resolve from that and ζ̂. ``tol`` is
     relative to each signal's own size, to that of each element for P, which so is as accurate where
     it has become small. Below ``floor`` (n,) ζ̂ is not resolved for its own sake, and it is
-    comparable in ``sizes`` (n,)
+    comparable in ``sizes`` (n,). What is ``before`` a window of some ``horizon`` goes on in it
     (SolverError: the tolerance cannot be reached, or P is not positive semidefinite).
     """
-    m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
-    horizon = float(mesh.edges[-1] - mesh.edges[0])
-    deviation = np.sqrt(np.diag(P0))
-    unit = _units(m.A, deviation, horizon, sizes)
-    P0, start = P0 / np.outer(unit, unit), start / unit[:, None]
+    if before is None:
+        m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
+        horizon = horizon or float(mesh.edges[-1] - mesh.edges[0])
+        unit, variance, tol = _scaled(m, P0, horizon, sizes, tol, name)
+        first = pair(P0 / (variance * np.outer(unit, unit)), start / unit[:, None])
+    else:
+        unit, variance, tol = before.unit, before.variance, before.tol
+        first = pair(*quotient(before.pair.final))
     least = float((floor / unit).max(initial=0.0))
-    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
-    # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
-    # entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P by nothing
-    # is rounding, and is not made larger.
-    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), _UNSEEN / horizon)
-    fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
-    if fall > _FALL:
-        raise SolverError(
-            f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
-            "the digits of a double; lower observer.P0, or raise observer.regularisation or the "
-            "noise"
-        )
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         m, extras = model(t, inside)
@@ -181,7 +192,11 @@ def run_filter(
 
     def followed(estimate: Array, extras: tuple[Array, ...]) -> list[Kind]:
         found: list[Kind] = [(estimate.reshape(*estimate.shape[:2], -1), least)]
-        return found + ([] if monitor is None else list(monitor(unit[:, None] * estimate, extras)))
+        found += [] if monitor is None else list(monitor(unit[:, None] * estimate, extras))
+        return found if before is None else [
+            (signal, np.maximum(size, max(level, SHARE * float(size.max(initial=0.0)))))
+            for (signal, level), size in zip(found, before.sizes, strict=True)
+        ]
 
     def signals(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
         P, estimate = quotient(values)
@@ -193,17 +208,15 @@ def run_filter(
         return _in_front(grown > _GROWTH, found)
 
     problem = LinearProblem(
-        coefficients, pair(P0 / variance, start), signals, name,
+        coefficients, first, signals, name,
         renewal=lambda reached: pair(*quotient(reached)),
     )
     try:
-        # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
-        tol = max(tol, _LEFT * float(np.finfo(float).eps) * fall)
         # P may fall in less than times far from zero are told apart.
-        rule, begin = radau_rule(max(mesh.rule.stages, _STAGES)), mesh.edges[0]
-        mesh = Mesh(mesh.edges - begin, rule, mesh.origin + begin)
+        stages, begin = max(mesh.rule.stages, 0 if before else _STAGES), mesh.edges[0]
+        mesh = Mesh(mesh.edges - begin, radau_rule(stages), mesh.origin + begin)
         solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
-        P, _ = quotient(solution.trajectory.values)
+        P, estimate = quotient(solution.trajectory.values)
         error_estimate = _error(problem, solution.trajectory, followed)
     except np.linalg.LinAlgError as error:
         raise SolverError(f"the Riccati equation of the {name} has no finite solution") from error
@@ -221,7 +234,36 @@ def run_filter(
             f"(eigenvalue {relative.min():.1e} of its trace); lower observer.P0, or raise "
             "observer.regularisation"
         )
-    return Filtered(solution.trajectory, variance, unit, error_estimate, solution.extras)
+    mesh = solution.trajectory.mesh
+    kinds = followed(estimate, solution.extras)
+    largest = [np.abs(signal).max(axis=(0, 1)) for signal, _ in kinds]
+    return Filtered(
+        solution.trajectory, variance, unit, error_estimate,
+        tuple(Trajectory(mesh, extra) for extra in solution.extras), tol,
+        tuple(map(np.maximum, largest, before.sizes) if before else largest),
+    )
+
+
+def _scaled(
+    m: StateSpace, P0: Array, horizon: float, sizes: Array | float, tol: float, name: str
+) -> tuple[Array, float, float]:
+    """Units (n,) of ζ, a factor of all covariances, and the tolerance that rounding leaves."""
+    deviation = np.sqrt(np.diag(P0))
+    unit = _units(m.A, deviation, horizon, sizes)
+    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
+    # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
+    # entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P by nothing
+    # is rounding, and is not made larger.
+    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), _UNSEEN / horizon)
+    fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
+    if fall > _FALL:
+        raise SolverError(
+            f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
+            "the digits of a double; lower observer.P0, or raise observer.regularisation or the "
+            "noise"
+        )
+    # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
+    return unit, variance, max(tol, _LEFT * float(np.finfo(float).eps) * fall)
 
 
 def _deviations(P: Array) -> Array:

@@ -16,7 +16,7 @@ from gpebo_cli.evidence.excitation import known_at
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers._base import AffineStateMap, Measurements, Observation, Sampling
-from gpebo_cli.observers.reduced.condensed import condensed, thinned
+from gpebo_cli.observers.reduced.condensed import lean
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
 from gpebo_cli.observers.reduced.system import SMALL, reduced_system
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
@@ -91,10 +91,9 @@ class Gpebo:
         keeps &= not (self.bounds or {}).get("states")  # looked at between samples, too
         if not keeps or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
-        few = thinned(system, signals, solver) if keeps else None
-        if few is None:
+        if not keeps:
             return self._observe(system, signals, solver)
-        return condensed(self._observe(system, few, solver), signals, few, solver)
+        return lean(lambda each: self._observe(system, each, solver), system, signals, solver)
 
     def _observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings

@@ -24,7 +24,7 @@ of the standard deviations of x̂; its correlation with ζ̂ (of order T_s) is n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -35,7 +35,7 @@ from gpebo_cli.evidence.uncertainty import noise_level
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
 from gpebo_cli.observers._base import (
     AffineStateMap,
     Filtering,
@@ -45,13 +45,15 @@ from gpebo_cli.observers._base import (
     SignalNoise,
 )
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
-from gpebo_cli.observers._riccati import Filtered, StateSpace, run_filter
+from gpebo_cli.observers._riccati import Filtered, StateSpace, filter_windows, pair
+from gpebo_cli.observers.reduced.condensed import beyond, lean, thinned
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.observers.reduced.split import Split, units_along
-from gpebo_cli.observers.reduced.system import ReducedSystem, reduced_system
+from gpebo_cli.observers.reduced.system import SMALL, ReducedSystem, reduced_system
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.schema import per_name
@@ -229,28 +231,24 @@ class KalmanBucy:
 
         ConfigError: settings that do not fit the plant.
         """
-        signals.check_memory(system, _HELD)
-        known = reduced_system(
-            system, replace(signals, asked=None), solver, xi_a0=self.xi_a0, form=self.form
-        )
-        evidence = Plain().observe(known)
-        mesh, q, split = known.mesh, system.q, known.first.split
-        noise = signals.noise or SignalNoise(
-            np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
-        )
-        rows, note = noise.rows, known.note
-        unknown = rows is not None and not noise.variances.any()
-        if rows is not None and unknown and evidence.errors is not None:
-            alike = np.concatenate([np.zeros(system.m), np.ones(system.r)])
-            level = noise_level(evidence.errors, evidence.regression, rows, alike)
-            noise = replace(noise, outputs=np.full(system.r, np.nan_to_num(level)))
-            note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
-            unknown = not level > 0.0
+        if signals.asked is None or system.n > SMALL or solver.name == "ivp":
+            signals = replace(signals, asked=None)
+            signals.check_memory(system, _HELD)
 
-        def steps(inside: Array) -> Array | float:
-            if rows is None:
-                return 1.0
-            return rows.intensities(inside) / noise.sample_time
+        def reduced_on(signals: Measurements) -> ReducedSystem:
+            return reduced_system(system, signals, solver, xi_a0=self.xi_a0, form=self.form)
+
+        evidence = lean(lambda each: Plain().observe(reduced_on(each)), system, signals, solver)
+        few = thinned(system, signals, solver)
+        known = reduced_on(replace(few or signals, wanted=None))
+        mesh, q, split = known.mesh, system.q, known.first.split
+        windows = [mesh] if few or signals.asked is None else mesh.windows()
+        noise, level = _noise(signals, system, evidence)
+        note = known.note
+        note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
+        unknown = noise.rows is not None and not noise.variances.any()
+
+        steps = _steps(noise, mesh if few else None)
 
         def reduced(t: Array, inside: Array) -> FilterModel:
             return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)
@@ -265,8 +263,6 @@ class KalmanBucy:
         variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
         P0 = _initial_covariance(variances, known)
         process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
-        inside = mesh.inside.ravel()
-        known_of = reduced(mesh.points.ravel(), inside)
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
         of_states = known.form.units.states, known.form.units.states[:, None] / sizes
@@ -277,18 +273,16 @@ class KalmanBucy:
             noise.variances * noise.sample_time, process,
             self.regularisation**2 * noise.sample_time * varies,
         )
-        regularised = bool(model_noise.measured(known_of, steps(inside))[2].any())
+        fastest, offsets, regularised = _largest(reduced, windows, model_noise, steps, sizes)
         # What w is beside the part of x that is known may be rounding of that, added up.
-        turns = 1.0 + float(
-            np.abs(known_of.A * sizes / sizes[:, None]).max() * (mesh.edges[-1] - mesh.edges[0])
-        )
-        beside = turns * np.abs(split.dual) @ np.abs(known_of.offset).max(axis=0)
+        turns = 1.0 + fastest * float(mesh.edges[-1] - mesh.edges[0])
+        beside = turns * np.abs(split.dual) @ offsets
         floor = _ROUNDING / solver.tol * np.concatenate([np.zeros(q), beside])
 
         def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
             s = reduced(t, inside)
             space = model_noise.state_space(s, q, split, steps(inside))
-            return space, (s.offset, s.gain, s.direct, s.projector)
+            return space, (s.offset, s.gain, s.direct)
 
         def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
             offset, gain = (e / units for e, units in zip(extras, of_states, strict=False))
@@ -303,12 +297,17 @@ class KalmanBucy:
         share = f"{self.regularisation:g} of each equation's own under P0 "
         if regularised:
             used["regularised_with"] = f"noise of {share}at {noise.sample_time:g} s"
-        filtered = run_filter(
-            model, start[:, None], P0, mesh, tol=solver.tol, max_elements=solver.max_elements,
+        parts = filter_windows(
+            model, start[:, None], P0, windows, tol=solver.tol, max_elements=solver.max_elements,
             monitor=monitor, floor=floor, sizes=sizes,
             name=f"Kalman-Bucy filter of plant {system.name}",
         )
-        offset, gain, direct, projector = (Trajectory(filtered.mesh, e) for e in filtered.extras)
+        filtered = next(parts) if len(windows) == 1 else _kept(parts, mesh, signals.wanted)
+        if few is not None:
+            filtered = _along_all(filtered, signals, few, solver, lambda t, inside: _errors(
+                reduced(t, inside), filtered.at(t, inside)[0], model_noise, steps(inside), q, split
+            ))
+        offset, gain, direct = filtered.extras
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
             m = model_noise.state_space(reduced(t, inside), q, split, steps(inside))
@@ -316,11 +315,11 @@ class KalmanBucy:
                 transpose(m.c) @ np.linalg.solve(m.V, m.c)
             )
 
-        windows = window_gramians(
+        gramians = window_gramians(
             information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
             max_elements=solver.max_elements,
         )
-        observability = _uniform_observability(windows, P0, projector, known, sizes)
+        observability = _uniform_observability(gramians, P0, known, sizes)
         return Observation(
             regression=evidence.regression,
             state_map=FilterStateMap(
@@ -352,6 +351,101 @@ class KalmanBucy:
 OBSERVER = KalmanBucy
 
 
+def _noise(
+    signals: Measurements, system: DescriptorSystem, evidence: Observation
+) -> tuple[SignalNoise, float]:
+    """The noise of the signals, and the level that was taken from the residual, or 0."""
+    noise = signals.noise or SignalNoise(
+        np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time
+    )
+    if noise.rows is None or noise.variances.any() or evidence.errors is None:
+        return noise, 0.0
+    alike = np.concatenate([np.zeros(system.m), np.ones(system.r)])
+    level = noise_level(evidence.errors, evidence.regression, noise.rows, alike)
+    level = float(np.nan_to_num(level))
+    return replace(noise, outputs=np.full(system.r, level)), level
+
+
+def _steps(noise: SignalNoise, mesh: Mesh | None) -> Callable[[Array], Array | float]:
+    """Seconds for each row at times (N,) over the sample time; the same in elements of a mesh."""
+    rows = noise.rows
+    if rows is None:
+        return lambda _inside: 1.0
+    if mesh is None:
+        return lambda inside: rows.intensities(inside) / noise.sample_time
+    counts = np.diff(np.interp(mesh.edges, rows.t, np.arange(len(rows.t))))
+    seconds = mesh.steps / counts / noise.sample_time
+    return lambda inside: seconds[
+        np.searchsorted(mesh.edges, inside, side="right").clip(1, mesh.size) - 1
+    ]
+
+
+def _largest(
+    model: Callable[[Array, Array], FilterModel], windows: Sequence[Mesh], noise: NoiseModel,
+    steps: Callable[[Array], Array | float], sizes: Array,
+) -> tuple[float, Array, bool]:
+    """Largest of A in units of ``sizes`` (n,), of offsets (states,); whether V is regularised."""
+    fastest, offsets, regularised = 0.0, np.zeros(1), False
+    for window in windows:
+        inside = window.inside.ravel()
+        s = model(window.points.ravel(), inside)
+        fastest = max(fastest, float(np.abs(s.A * sizes / sizes[:, None]).max()))
+        offsets = np.maximum(offsets, np.abs(s.offset).max(axis=0))
+        regularised |= bool(noise.measured(s, steps(inside))[2].any())
+    return fastest, offsets, regularised
+
+
+def _errors(
+    s: FilterModel, P: Array, noise: NoiseModel, steps: Array | float, q: int, split: Split
+) -> ErrorSystem:
+    """What errors of the signals do to ζ̂ and to the state's offset, with P (N, n, n)."""
+    m = noise.state_space(s, q, split, steps)
+    transposed = np.linalg.solve(m.V, transpose(np.asarray(P @ transpose(m.c) + m.N)))
+    L = transpose(np.asarray(transposed, dtype=np.float64))
+    inward = L @ transpose(s.rows) @ s.in_measurement - s.from_noise
+    n = P.shape[-1]
+    C = np.zeros((1, n + s.direct.shape[1], n))
+    C[0, :n] = np.eye(n)
+    D = np.concatenate([np.zeros_like(inward), s.direct], axis=1)
+    return ErrorSystem(m.A - L @ m.c, inward, C, D)
+
+
+def _along_all(
+    found: Filtered, signals: Measurements, few: Measurements, solver: SolverSettings,
+    errors: ErrorsAt,
+) -> Filtered:
+    """What was ``found`` along few signals, along all of them; P does not depend on them."""
+    mesh = Mesh(found.mesh.origin + found.mesh.edges, found.mesh.rule)
+    pairs, offset, n = found.pair.values.copy(), found.extras[0].values.copy(), len(found.unit)
+    size, estimate = (found.unit * found.sizes[0])[:, None], found.error_estimate
+    for part, _, added, _, error in beyond(errors, mesh, signals, few, size, solver):
+        pairs[part, :, n:, n:] += (added[:, :, :n] / found.unit)[..., None]
+        offset[part] += added[:, :, n:]
+        estimate = max(estimate, error)
+    return replace(
+        found, pair=Trajectory(found.mesh, pairs), error_estimate=estimate,
+        extras=(Trajectory(found.mesh, offset), *found.extras[1:]),
+    )
+
+
+def _kept(parts: Iterable[Filtered], mesh: Mesh, t: Array | None) -> Filtered:
+    """What windows of a mesh give at the times t (M,); the mesh is the one that they resolve."""
+    asked = np.union1d(mesh.span, mesh.span if t is None else t)
+    kept: list[tuple[Array, ...]] = []
+    edges, error = [mesh.edges[:1] + mesh.origin], 0.0
+    for part, own in zip(parts, mesh.shares(asked), strict=True):
+        kept.append((*part.at(own), *(extra(own) for extra in part.extras)))
+        edges.append(part.mesh.edges[1:] + part.mesh.origin)
+        error = max(error, part.error_estimate)
+    P, estimate, *extras = map(np.concatenate, zip(*kept, strict=True))
+    whole = Mesh(np.concatenate(edges), mesh.rule)
+    pairs = np.array([pair(*each) for each in zip(P, estimate, strict=True)])
+    return Filtered(
+        whole.sampled(asked, pairs), 1.0, np.ones(len(P[0])), error,
+        tuple(whole.sampled(asked, extra) for extra in extras),
+    )
+
+
 def _initial_covariance(variances: Array, known: ReducedSystem) -> Array:
     """P(start) (n, n) of what is possible: w = offset + from_unknowns θ + V z."""
     q, n, dual = known.system.q, len(variances), known.first.split.dual
@@ -362,13 +456,13 @@ def _initial_covariance(variances: Array, known: ReducedSystem) -> Array:
 
 
 def _uniform_observability(
-    windows: WindowGramians, P0: Array, projector: Trajectory, known: ReducedSystem, sizes: Array
+    windows: WindowGramians, P0: Array, known: ReducedSystem, sizes: Array
 ) -> Requirement:
     """λ_min of M, of ζ in units of ``sizes`` (n,), over all windows, in units of P(0)⁻¹.
 
     It is that in the directions that ζ has.
     """
-    P = projector(windows.starts)
+    P = known.matrices(windows.starts, windows.starts).split.projector
     n, q = len(P0), known.system.q
     inside = _inside(q, known.first.split, P) * sizes / sizes[:, None]
     scale = np.sqrt(np.diag(P0)) / sizes
@@ -406,7 +500,8 @@ class FilterStateMap(Filtering):
     @property
     def times(self) -> Array:
         """The points of the filter's mesh, because its errors depend on what it reached there."""
-        return np.unique(self.filtered.mesh.points)
+        found = self.filtered.pair
+        return found.t if isinstance(found, Samples) else np.unique(found.mesh.points)
 
     def at(self, t: Array) -> Reconstruction:
         """The affine map at the times t (M,), ascending."""

@@ -12,6 +12,7 @@ not depend on the number of samples.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from math import prod
@@ -32,6 +33,15 @@ _LARGE = 1000  # numbers in the system of errors, which then are not kept
 _AT_ONCE = 1 << 13  # elements of the signals, about
 _INSIDE = 1e-3  # of a step: on which side of an edge a point is
 _NEAR = 1e-9  # of a step: an edge that is nearer to a sample is that sample
+
+
+def lean(
+    observe: Callable[[Measurements], Observation], system: DescriptorSystem,
+    signals: Measurements, solver: SolverSettings,
+) -> Observation:
+    """What ``observe`` finds along the signals, by way of :func:`thinned` ones if there are any."""
+    few = thinned(system, signals, solver)
+    return observe(signals) if few is None else condensed(observe(few), signals, few, solver)
 
 
 def thinned(
@@ -72,35 +82,19 @@ def condensed(
     size = np.abs(extension.values[..., :1]).max(axis=(0, 1))  # of ξ_a, (k, 1)
     mesh, (rows, p) = regression.mesh, regression.psi.values.shape[2:]
     Y, offset = regression.Y.values.copy(), state_map.offset.values.copy()
-    fine = edges(signals.mesh.edges, mesh.edges)
-    cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
-    first, estimate, count = 0, found.error_estimate, 0
-    zeta = np.zeros((len(size), 1))
-    errors = _interpolated(errors, mesh, solver.tol)
-    factor = np.zeros((0, p + 1))
-    while first < mesh.size:
-        last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
-        window = Mesh(fine[cuts[first] : cuts[last] + 1], signals.mesh.rule)
-        seen = _part(signals, window)
-        added, zeta, error = driven(
-            errors, partial(_beyond, seen, few), window, zeta, tol=solver.tol,
-            max_elements=solver.max_elements, floor=size,
-        )
+    estimate, count, factor = found.error_estimate, 0, np.zeros((0, p + 1))
+    for part, added, at_points, instants, error in beyond(errors, mesh, signals, few, size, solver):
         estimate = max(estimate, error)
-        part = slice(first, last)
         Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :rows, 0]), mesh, part)
-        points, near = mesh.points[part], _INSIDE * added.mesh.steps.min()
-        inside = points.clip(points[:, :1] + near, points[:, -1:] - near)  # of a short element
-        more = added(points.ravel(), inside.ravel())[:, rows:]
-        offset[part] += more.reshape(*points.shape, -1)
-        at = np.flatnonzero(np.isin(added.mesh.edges[:-1], seen.mesh.edges))
+        offset[part] += at_points[:, :, rows:]
+        at = np.flatnonzero(np.isin(added.mesh.edges[:-1], instants))
         t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
         full = regression.Y(t, t_in) + added.values[at, 0, :rows, 0]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
         factor = np.asarray(
             np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
         )
-        count, first = count + len(at), last
+        count += len(at)
     duration = float(mesh.edges[-1] - mesh.edges[0])
     return replace(
         found, error_estimate=estimate, respond=None,
@@ -109,6 +103,34 @@ def condensed(
         ),
         state_map=replace(state_map, offset=Trajectory(mesh, offset)),
     )
+
+
+def beyond(
+    errors: ErrorsAt, mesh: Mesh, signals: Measurements, few: Measurements, size: Array,
+    solver: SolverSettings,
+) -> Iterator[tuple[slice, Trajectory, Array, Array, float]]:
+    """What signals beyond ``few`` of them do by a system of errors, whose ζ is of a size (k, 1).
+
+    Window by window of some elements of the mesh: which ones, the outputs (O, 1), their values
+    (K, s + 1, O) at the mesh's points, the samples (N,) there, and an error estimate.
+    """
+    fine = edges(signals.mesh.edges, mesh.edges)
+    cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
+    first, zeta = 0, np.zeros((len(size), 1))
+    errors = _interpolated(errors, mesh, solver.tol)
+    while first < mesh.size:
+        last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
+        window = Mesh(fine[cuts[first] : cuts[last] + 1], signals.mesh.rule)
+        seen, part = _part(signals, window), slice(first, last)
+        added, zeta, error = driven(
+            errors, partial(_beyond, seen, few), window, zeta, tol=solver.tol,
+            max_elements=solver.max_elements, floor=size,
+        )
+        points, near = mesh.points[part], _INSIDE * added.mesh.steps.min()
+        inside = points.clip(points[:, :1] + near, points[:, -1:] - near)  # of a short element
+        at_points = added(points.ravel(), inside.ravel()).reshape(*points.shape, -1)
+        yield part, added, at_points, seen.mesh.edges, error
+        first = last
 
 
 def _beyond(signals: Trajectory, few: Measurements, t: Array, inside: Array) -> Array:

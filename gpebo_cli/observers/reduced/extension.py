@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import repeat
 from typing import Any
 
 import numpy as np
@@ -123,7 +124,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         return _assembled(reduced, _in_units(marched, units), monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
-        return joined(_over(windows, reduced, problem, monitor), mesh.size)
+        return joined(_over(mesh, reduced, problem, monitor), mesh.size)
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
     solution = own(problem, mesh, **limits)
     return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
@@ -177,12 +178,12 @@ class _Monitor:
 
 
 def _over(
-    windows: Iterable[Mesh], reduced: ReducedSystem, problem: LinearProblem, monitor: _Monitor
+    mesh: Mesh, reduced: ReducedSystem, problem: LinearProblem, monitor: _Monitor
 ) -> Iterator[Extension]:
     """The extension on one window after the other, so that little is held beside the result."""
     solver, units, asked = reduced.solver, monitor.units, reduced.signals.asked
-    end = reduced.signals.span[1]
-    for window in windows:
+    shares: Iterable[Array] = repeat(mesh.edges) if asked is None else mesh.shares(asked)
+    for window, own in zip(mesh.windows(), shares, strict=False):
         solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
         values = solution.trajectory.values
         problem = replace(
@@ -191,12 +192,7 @@ def _over(
         )
         found = monitor.next_window(len(values))
         part = _assembled(reduced, _in_units(solution, units), found, as_found=False)
-        if asked is None:
-            yield part
-            continue
-        first, stop = part.mesh.span
-        upto = len(asked) if stop == end else asked.searchsorted(stop)
-        yield part.kept_at(asked[asked.searchsorted(first) if first > asked[0] else 0 : upto])
+        yield part if asked is None else part.kept_at(own)
 
 
 def joined(parts: Iterable[Extension], elements: int) -> Extension:

@@ -179,7 +179,7 @@ def reduced_system(
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights, units,
-            piecewise=in_part and system.n <= SMALL and len(mesh.windows()) > 1,
+            piecewise=system.n <= SMALL and len(mesh.windows()) > 1,
         )
     except NotObservableError as error:
         used = as_given(system, t, inside, at, signals.derivatives)

@@ -29,9 +29,10 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
+from gpebo_cli.numerics.radau import RadauRule
 from gpebo_cli.observers._base import Observation
-from gpebo_cli.observers._riccati import StateSpace, run_filter
+from gpebo_cli.observers._riccati import Filtered, StateSpace, filter_windows
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
 from gpebo_cli.observers.reduced.split import units_along
 from gpebo_cli.observers.reduced.system import ReducedSystem
@@ -100,14 +101,17 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         SolverError: S cannot be resolved.
     """
     mesh, basis, dual = reduced.mesh, reduced.basis, reduced.first.split.dual
-    o, variances = reduced.first, reduced.units**2
+    variances = reduced.units**2
     horizon = float(mesh.edges[-1] - mesh.edges[0])
-    A_0 = np.broadcast_to(o.dynamics, (mesh.points.size, *o.dynamics.shape[1:]))
-    n = basis.shape[1]
-    unstable = np.maximum(np.linalg.eigvals(A_0).real.max(axis=1, initial=0.0), 0.0)
-    kappa = max(2.0 * float(np.sqrt((unstable**2).mean())), _PER_HORIZON / horizon)
-    norms = np.linalg.norm(o.residual @ o.algebraic @ basis * reduced.units, 2, axis=(1, 2))
-    size = max(float(np.sqrt((norms**2).mean())), np.finfo(float).tiny)
+    n, squares, windows = basis.shape[1], np.zeros(2), mesh.windows()
+    for window in windows:
+        o = reduced.matrices(window.points.ravel(), window.inside.ravel())
+        unstable = np.maximum(np.linalg.eigvals(o.dynamics).real.max(axis=1, initial=0.0), 0.0)
+        norms = np.linalg.norm(o.residual @ o.algebraic @ basis * reduced.units, 2, axis=(1, 2))
+        means = (unstable**2).mean(), (norms**2).mean()
+        squares += np.multiply(means, window.points.size / mesh.points.size)
+    kappa = max(2.0 * float(np.sqrt(squares[0])), _PER_HORIZON / horizon)
+    size = max(float(np.sqrt(squares[1])), np.finfo(float).tiny)
 
     def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
         o = reduced.matrices(t, inside)
@@ -125,13 +129,21 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     V = dual @ reduced.begin.basis
     V = V * units_along(V, reduced.units)
     S0 = kappa * V @ V.T
-    S = run_filter(
-        model, np.zeros((n, 0)), S0, mesh, tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
+    parts = filter_windows(
+        model, np.zeros((n, 0)), S0, windows, tol=_TOLERANCE,
+        max_elements=reduced.solver.max_elements,
         name=f"output injection for plant {reduced.system.name}", sizes=reduced.units,
     )
+    S = joined([_covariance(part, mesh.rule) for part in parts])
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weight = dual @ o.split.projector @ basis @ S.at(t, inside)[0] / size**2
+        weight = dual @ o.split.projector @ basis @ S(t, inside) / size**2
         return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
 
-    return gain, Mesh(np.unique(S.mesh.origin + S.mesh.edges), mesh.rule)
+    return gain, S.mesh
+
+
+def _covariance(found: Filtered, rule: RadauRule) -> Trajectory:
+    """S on the elements that resolve it, by a rule that may have fewer stages than were needed."""
+    mesh = Mesh(found.mesh.origin + found.mesh.edges, rule)
+    return mesh.along(lambda t, inside: found.at(t, inside)[0])
