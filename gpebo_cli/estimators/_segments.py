@@ -10,7 +10,7 @@ from itertools import chain, islice
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator
-from gpebo_cli.estimators._registry import Several, able
+from gpebo_cli.estimators._registry import Several, SeveralEstimates, able
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorsAt, one_after_another
@@ -49,6 +49,12 @@ def tuned_for(estimator: Estimator, requirement: Callable[[Estimator], Requireme
     return estimator
 
 
+def goes_on(estimator: Estimator) -> bool:
+    """Whether it takes a long regression window by window."""
+    members = estimator.members if isinstance(estimator, Several) else (estimator,)
+    return all(isinstance(member, Windowed) for member in members)
+
+
 def raised(estimator: Estimator, requirement: Requirement) -> Estimator:
     """The estimator, with higher gains where none were given and the default is too low."""
     return estimator.raised(requirement) if isinstance(estimator, GainEstimator) else estimator
@@ -63,6 +69,9 @@ def estimate(
     At a reset η̂ becomes T η̂ + τ and the extension ``ExtensionState.after``. A time at which
     there is a reset belongs to what follows it.
     """
+    if isinstance(estimator, Several):
+        each = [estimate(member, regression, t, shown) for member in estimator.members]
+        return SeveralEstimates(tuple(each), tuple(len(m.cases) for m in estimator.members))
     if not regression.p:  # constraints alone determine the states
         nothing = Requirement("none", True, {}, "there is nothing to estimate")
         return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)

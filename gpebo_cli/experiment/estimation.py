@@ -80,7 +80,7 @@ def continuous(
     observer: Observer, estimator: estimators.Estimator, stage: Stage,
 ) -> Estimated:
     """Observer and estimator as differential equations (SolverError)."""
-    t, goes_on = source.t, isinstance(estimator, estimators.Windowed)
+    t, goes_on = source.t, estimators.goes_on(estimator)
 
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source

@@ -8,8 +8,8 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.linalg import largest_over_time, transpose
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 
 _TOLERANCE = 1e-12
@@ -40,33 +40,54 @@ def filtered(
     p, units = outer.values.shape[2], dynamics.units
     # It is solved for comparable parameters: what is small in its unit only is no rounding.
     own = units[:, None] * np.append(units, 1.0)
-    start = np.zeros((p, p + 1)) if start is None else own * start
     outer = Trajectory(outer.mesh, own * outer.values)
-    turn = Trajectory(dynamics.A.mesh, dynamics.A.values * units / units[:, None])
+    mesh, A, b = dynamics.A.mesh, dynamics.A.values, dynamics.b.values
+    turn = Trajectory(mesh, np.concatenate([A * units / units[:, None], (b / units)[..., None]], 3))
+    known, sizes = np.zeros((p, p + 1)) if start is None else own * start, np.zeros((p, p + 1))
+    decay, pieces = np.diag(rates + dynamics.forgetting), list[Trajectory]()
+    for window in outer.mesh.windows():
+        pieces.append(_over(window, outer, decay, gains, turn, known, sizes))
+        known = pieces[-1].final
+        sizes = np.maximum(sizes, largest_over_time(pieces[-1].values, 2))
+    found = joined(pieces)
+    return Trajectory(found.mesh, found.values / own)
+
+
+def _over(
+    mesh: Mesh, outer: Trajectory, decay: Array, gains: Array, turn: Trajectory, start: Array,
+    sizes: Array,
+) -> Trajectory:
+    """[Ω | 𝒴] on a window, for [𝔸 | 𝕓] and from ``start`` (p, p + 1), which was of ``sizes``."""
+    p = len(start)
     eye = np.eye(p)
-    decay = np.diag(rates + dynamics.forgetting)
 
     def of_omega(t: Array, inside: Array) -> LinearEquation:
-        A = turn(t, inside)
+        A = turn(t, inside)[..., :p]
         left = -(decay + transpose(A))
         M = np.einsum("nij,kl->nikjl", left, eye) - np.einsum("ij,nlk->nikjl", eye, A)
         f = gains[:, None] * outer(t, inside)[..., :p]
         return LinearEquation(None, M.reshape(-1, p * p, p * p), f.reshape(-1, p * p, 1))
 
-    problem = LinearProblem(of_omega, start[:, :p].reshape(-1, 1), name="filter of the regressor")
-    omega = solve(problem, outer.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
+    problem = LinearProblem(
+        of_omega, start[:, :p].reshape(-1, 1), name="filter of the regressor",
+        floor=sizes[:, :p].reshape(-1, 1),
+    )
+    omega = solve(problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
 
     def of_rhs(t: Array, inside: Array) -> LinearEquation:
         sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
-        f = np.einsum("nij,nj->ni", sampled, dynamics.b(t, inside) / units)
+        moving = turn(t, inside)
+        f = np.einsum("nij,nj->ni", sampled, moving[..., p])
         f = f + gains * outer(t, inside)[..., p]
-        return LinearEquation(None, -(decay + transpose(turn(t, inside))), f[..., None])
+        return LinearEquation(None, -(decay + transpose(moving[..., :p])), f[..., None])
 
     # From the mesh of Ω on: in one of its elements Ω is a polynomial.
-    problem = LinearProblem(of_rhs, start[:, p:], name="filter of the regression")
+    problem = LinearProblem(
+        of_rhs, start[:, p:], name="filter of the regression", floor=sizes[:, p:]
+    )
     rhs = solve(problem, omega.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
     t, inside = rhs.mesh.points.ravel(), rhs.mesh.inside.ravel()
     both = np.concatenate(
         [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2
     )
-    return rhs.mesh.trajectory(both / own)
+    return rhs.mesh.trajectory(both)
