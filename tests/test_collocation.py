@@ -10,7 +10,7 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.mesh import Looked, Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
@@ -358,3 +358,21 @@ def test_elements_as_short_as_times_are_told_apart_say_why(start, said):
     mesh = Mesh(start + np.array([0.0, 0.5, 1.0]), radau_rule(4))
     with pytest.raises(SolverError, match=said):
         refine(evaluate, mesh, tol=1e-9, max_elements=10_000, name="plant p")
+
+
+def test_signals_in_units_are_as_well_resolved_as_without():
+    """Three waves, of which the slow one is seen to be resolved in none but its own unit."""
+    rule, units = radau_rule(8), np.array([1e-7, 1.0, 1e5])
+    t = (np.arange(5)[:, None] + rule.points)[..., None]
+    waves = np.sin(np.array([0.1, 2.0, 4.0]) * t)
+    found = Looked.at(waves * units, rule).unresolved(rule, units)
+    np.testing.assert_allclose(found, unresolved(waves, rule), rtol=1e-9)
+
+
+def test_a_signal_is_not_given_where_it_was_not_kept():
+    mesh = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
+    kept = mesh.sampled(np.array([0.5, 1.5]), np.array([3.0, 4.0]))
+    assert kept(np.array([1.5])) == 4.0
+    for t in (1.0, 2.0):
+        with pytest.raises(ValueError, match="not kept"):
+            kept(np.array([t]))

@@ -98,7 +98,7 @@ def _carried(rng, k=6, s=5, n=3, c=2, constant=False):
     return (
         values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
         rng.normal(size=(maps, n, n)), rng.normal(size=(k, n, c)), noise,
-        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), np.full(k, 0.1), 0.3, 8.0, 16.0, 1e-9,
+        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), np.full(k, 0.1), 0.3, 8.0, 4.0, 1e-9,
     )
 
 

@@ -24,7 +24,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import outer_products
-from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.regression.samples import SampledRegression, delayed
 from gpebo_cli.regression.text import regression_from_mapping
 from gpebo_cli.settings import DataSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -639,3 +639,13 @@ def test_a_sweep_cannot_read_standard_input(tmp_path):
     done = gpebo("run", "-m", "data.file=-", "estimator.gamma=1,2", cwd=tmp_path)
     assert done.returncode != 0
     assert "standard input" in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(("hold", "between"), [("linear", 0.75), ("zoh", 0.0)])
+def test_what_is_delayed_lies_between_samples_as_the_hold_has_it(hold, between):
+    """x = 3 t at t = 0 and 1, seen 0.75 s later: at first there are two samples, then three."""
+    first = np.array([0.0]), np.array([[0.0]])
+    found, past = delayed(first, np.array([1.0]), np.array([[3.0]]), 0.75, hold)
+    assert found == pytest.approx(np.array([[between]]))
+    again, _ = delayed(past, np.array([2.0]), np.array([[6.0]]), 0.75, hold)
+    assert again == pytest.approx(np.array([[3.0 * 1.25 if hold == "linear" else 3.0]]))
