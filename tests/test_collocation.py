@@ -10,6 +10,7 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
+from gpebo_cli.numerics.errors import judged_errors
 from gpebo_cli.numerics.mesh import Looked, Mesh, Trajectory, initial_mesh, unresolved
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
@@ -376,3 +377,12 @@ def test_a_signal_is_not_given_where_it_was_not_kept():
     for t in (1.0, 2.0):
         with pytest.raises(ValueError, match="not kept"):
             kept(np.array([t]))
+
+
+@pytest.mark.parametrize(("grown", "lost"), [([1e-9, 2.0, 5.0], 1), ([0.5, 0.7, 0.9], 3)])
+def test_a_component_is_lost_where_its_error_first_exceeds_it(grown, lost):
+    """In the second of three elements, or in none of them."""
+    carried, one = np.array(grown)[:, None, None], np.ones((1, 1))
+    problem = LinearProblem(lambda t, inside: None, one)
+    errors = judged_errors(problem, carried, carried.max(axis=0), 0 * one, one, 0 * one, one)
+    assert errors.lost == lost

@@ -16,7 +16,7 @@ import gpebo_cli
 from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators import LinearRegression, Trajectory
+from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
@@ -858,3 +858,12 @@ def test_steps_below_rounding_that_add_up_are_followed():
     np.testing.assert_allclose(found[0, :, 0], 1e-3 * (t - 0.1), atol=1e-12)
     nothing = scalar_path(mesh, None, ones, 0.0 * ones, 0.0 * mesh.points[..., None], t, 1.0)
     assert (scalar_law(nothing, np.ones(1), np.array([[10.0]])) == 1.0).all()
+
+
+def test_where_there_is_nothing_to_estimate_nothing_is_needed():
+    regression = LinearRegression.from_functions(
+        lambda t: np.zeros((*t.shape, 1, 0)), lambda t: np.zeros((*t.shape, 1)), [], 1.0
+    )
+    found = _segments.estimate(Drem(gamma=[1.0, 2.0]), regression, T)
+    assert found.requirement.holds
+    assert found.parameters(slice(None)).shape == (2, len(T), 0)

@@ -11,8 +11,10 @@ from units import Units, drawn, in_units
 
 from gpebo_cli import estimators, run
 from gpebo_cli.evidence.excitation import WELL
+from gpebo_cli.experiment.sensors import candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.settings import Settings, TimeSettings
 
 SHIPPED = sorted(
     path.relative_to(CONF / "plant").as_posix().removesuffix(".yaml")
@@ -156,6 +158,20 @@ def test_a_kalman_filter_is_the_same_in_any_units(name, states):
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
     a, b = (run.estimation.states[0] for run in (one, other))
     assert (np.abs(b / units.states - a) <= 1e-10 * np.abs(a).max(axis=0)).all()
+
+
+def test_sensors_are_as_good_in_any_units():
+    """Two outputs in units of their own: a row of ψ counts beside the others in comparable ones."""
+    content = yaml.safe_load((CONF / "plant" / "published/oregonator.yaml").read_text())
+    units = drawn(np.random.default_rng(8), plant_from_mapping(content), decades=True)
+    one, other = (
+        candidates(Settings({"name": "ls_drem"}, TimeSettings(horizon=5.0 * float(unit))),
+                   plant_from_mapping(made))
+        for made, unit in ((content, 1.0), (in_units(content, units), units.time))
+    )
+    assert [sensor.state for sensor in one] == [sensor.state for sensor in other]
+    for a, b in zip(one, other, strict=True):
+        assert (a.fall, a.fall_together) == pytest.approx((b.fall, b.fall_together), rel=1e-9)
 
 
 @pytest.mark.parametrize("seed", [102, 123])

@@ -100,10 +100,11 @@ class _Rows:
         mesh, final = extension.mesh, extension.assembled
         # ψ of an output that is a state is its gain, here of a state as large as the outputs are.
         sizes = largest_over_time(signals.states.values, 2)
-        size = np.abs(signals.outputs.values).max(initial=0.0) or 1.0
+        outputs = signals.outputs.values * reduced.first.output_scale
+        size = np.abs(outputs).max(initial=0.0) or 1.0
         gain = final.gain * (size / np.where(sizes > 0.0, sizes, size))[:, None]
         more = mesh.trajectory(gain[..., None] * gain[..., None, :])
-        psi = final.psi[:, -system.r :] / reduced.first.output_scale[:, None]
+        psi = final.psi[:, -system.r :]
         own = mesh.trajectory(np.swapaxes(psi, 1, 2) @ psi)
         self._gram, self._more = own.integral().final, more.integral().final
         self._terms = np.maximum(extension.scale[-1], np.abs(gain).max(axis=(0, 1), initial=0.0))

@@ -232,8 +232,8 @@ def _kernel_is_fixed(
     A kernel that starts to turn later on is refused then.
     """
     frame = first.split.frame
-    if frame is None or "E" in form.system.coefficients.constant:
-        return frame is not None
+    if frame is None:
+        return False
     signals = np.repeat(sample[None], len(t), axis=0) if form.follows_signals else None
     E = form.mass(t, t, signals) / form.units.equations[:, None]
     return split_in_frame(E, frame, form.units.states, rank_tol) is not None
