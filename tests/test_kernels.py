@@ -150,8 +150,8 @@ def _places(rng, k=6, s=5, count=50):
     return edges, rule.points, rule.barycentric, t, t + rng.choice([0.0, 0.01], len(t)), 4.0 * EPS
 
 
-def _model(rng, times=19, n=3, constant=False):
-    """E x' = A x of index 2: x1' = … , 0 = x1-like, in turned coordinates; and its scales."""
+def _model(rng, times=19, n=3, constant=False, turned=False):
+    """E x' = A x of index 2: x1' = … , 0 = x1-like, perhaps turned; and its scales."""
     orders, count = 2, 1 if constant else times
     E, A = 0.1 * rng.normal(size=(2, orders, count, n, n))
     E[:, :, -1] = 0.0
@@ -159,6 +159,9 @@ def _model(rng, times=19, n=3, constant=False):
     E[0, :, :-1, :-1] += np.eye(n - 1)
     A[:, :, -1, -1] = 0.0
     A[0, :, -1, 0], A[0, :, 0, -1] = 1.0, 1.0
+    if turned:  # then rows and columns differ in nothing but their numbers
+        left, right = np.linalg.qr(rng.normal(size=(2, n, n)))[0]
+        E, A = left @ E @ right, left @ A @ right
     return E, A, 2.0 ** rng.integers(-2, 3, size=n), 2.0 ** rng.integers(-2, 3, size=n), 0.5, orders
 
 
@@ -243,6 +246,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("observer", "regression_signals", partial(_regression, q=0, one=True)),
     ("structure", "reference", _start),
     ("structure", "reference", partial(_start, n=5)),
+    ("structure", "reference", partial(_start, n=4, turned=True)),
     ("structure", "levels", _levels),
     ("structure", "levels", partial(_levels, constraints=2, times=2)),
     ("structure", "bounds", _bounds),
