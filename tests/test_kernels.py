@@ -86,14 +86,14 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
-def _carried(rng, k=6, s=5, n=3, c=2, constant=False):
+def _carried(rng, k=6, s=5, n=3, c=2, constant=False, still=False):
     rule, maps = radau_rule(s), 1 if constant else k
     noise = rng.uniform(size=(1, n, n + c)) * np.ones((k, 1, 1)) if constant else (
         rng.uniform(size=(k, n, n + c))
     )
     t = rng.uniform(size=(k, s + 1, n, c))  # some components are smooth, and one is zero
     values = np.where(rng.uniform(size=(n, c)) < 0.5, np.cos(0.01 * t), rng.normal(size=t.shape))
-    values[:, :, 0, 0] = 0.0
+    values[:, :, :: 1 if still else n, :: 1 if still else c] = 0.0  # rounding alone is left
     used = min(4, s - 1)
     return (
         values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
@@ -264,7 +264,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
     *(("elements", "carried_errors", partial(_carried, **options)) for options in (
         {}, {"k": 2}, {"k": 9, "constant": True}, {"k": 1, "s": 2, "n": 1, "c": 1},
-        {"s": 14, "n": 5},
+        {"s": 14, "n": 5}, {"still": True},
     )),
     *(("elements", "series", partial(_series, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
