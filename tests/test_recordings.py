@@ -708,6 +708,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     assert gpebo(*command, cwd=tmp_path).returncode == 0
     data = yaml.safe_load((tmp_path / "data" / "log.yaml").read_text())
     assert (data["gaps"], data["missing"]) == ([9999.0], "interpolate")
+    assert data["scale"] is None  # what the file does not name, no override can set
     settings = DataSettings(file=str(tmp_path / "log.csv"), missing="interpolate", gaps=[9999.0])
     system = plant_from_mapping(plant, "level.yaml")
     read = read_table(settings, system).samples.outputs[:, 0]
