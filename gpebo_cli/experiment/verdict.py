@@ -140,15 +140,18 @@ def _vague_note(simulated: SimulationResult) -> str:
 
 
 def pauses_note(rows: Rows) -> str:
-    """What the last line of a run has to say of pauses in which rows are held, from "; " on."""
+    """What the last line of a run has to say of pauses, through which it has no data."""
     steps = np.diff(rows.t)
     long = steps[steps > PAUSE * np.median(steps)]
-    if rows.lines or not len(long):
+    if not len(long):
         return ""
+    how, instead = ("signals are interpolated", "") if rows.lines else (
+        "the last sample is held", "data.hold=linear, or "
+    )
     return (
-        f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s the last "
-        "sample is held (data.hold=zoh), which biases estimates if the plant moves meanwhile: take "
-        "data.hold=linear, or a file for each part (data.file=[…])"
+        f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s {how} "
+        f"(data.hold={rows.hold}), which biases estimates if the plant moves meanwhile: take "
+        f"{instead}a file for each part (data.file=[…])"
     )
 
 
