@@ -28,7 +28,7 @@ from gpebo_cli.numerics.mesh import Trajectory
 # and by rounding over it, which costs Newton's method nothing that could be seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
-_SAME = 1e-14  # of a time: edges so near to one another are one
+_SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 
 
@@ -97,10 +97,9 @@ class Linearised:
         found, bounded = self.system.coefficients.of_time.resolved(edges)
         if not bounded or len(self.guess.mesh.edges) == 2:
             return found, bounded
-        # Where the iterate before passed a jump that this one passes a rounding later is no edge.
-        own = self.guess.mesh.edges
-        near = max(1e-9 * np.diff(own).min(), _SAME * np.abs(own).max())
-        return with_others(found, own[1:-1], near), bounded
+        # Where the iterate before passed a jump that this one passes a little later is no edge.
+        own, steps = self.guess.mesh.edges, self.guess.mesh.steps
+        return with_others(found, own[1:-1], _SAME * np.maximum(steps[1:], steps[:-1])), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None

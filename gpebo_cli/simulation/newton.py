@@ -96,10 +96,14 @@ def follow(
         length *= 2.0 if count <= _FAST else 1.0
     whole = joined(pieces)
     # Once more where elements end at jumps and kinks: those are instants of the iterate before.
-    for _ in range((len(pieces) > 1) + (len(Linearised(system, whole).switched) > 0)):
-        linear = replace(system, coefficients=Linearised(system, whole))
+    # Repeated iterates would let rounding of one instant grow in those that follow it.
+    switched = len(Linearised(system, whole).switched) > 0
+    for _ in range((len(pieces) > 1) + switched):
+        before, linear = whole, replace(system, coefficients=Linearised(system, whole))
         whole = cast(Trajectory, solve(linear, time, solver, np.inf))
         iterates, work = iterates + 1, work + 1.0
+    if switched:
+        change = max(change, _change(whole, before))
     return Effort(len(pieces), iterates, work, change)
 
 
@@ -147,9 +151,7 @@ def _window(
         if found is None:
             break
         work += 1.0 if full else np.log(_LOOSE) / np.log(solver.tol)
-        values = found.values
-        moved = values - found.mesh.along(guess).values
-        change = float((np.abs(moved).max(axis=(0, 1)) / signal_scale(values)).max())
+        change = _change(found, guess)
         # Each change is about the square of the one before times a constant.
         growth = max(1.0, change / before / before) if 0.0 < before < np.inf else np.inf
         expected = min(change, _SAFETY * growth * change * change)
@@ -168,6 +170,12 @@ def _window(
             "have no solution that slides along a jump"
         )
     raise SolverError(said)
+
+
+def _change(found: Trajectory, before: Trajectory) -> float:
+    """Of the states from one iterate to the next, relative to their size."""
+    moved = np.abs(found.values - found.mesh.along(before).values).max(axis=(0, 1))
+    return float((moved / signal_scale(found.values)).max())
 
 
 def _at_rest(x: Array, start: float, length: float, solver: SolverSettings) -> Trajectory:

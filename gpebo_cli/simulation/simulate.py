@@ -93,8 +93,10 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         # Along a guess that is wrong by δ, the independent path is wrong by δ² only.
         linear = replace(system, coefficients=Linearised(system, found.signals.states))
         found = _simulate_linear(linear, time, solver)
+    errors = found.state_errors
     return replace(
         found, effort=effort, error_estimate=max(found.error_estimate, effort.last_change),
+        state_errors=None if errors is None else np.maximum(errors, effort.last_change),
         bounded=found.bounded and bounded,
     )
 

@@ -213,7 +213,7 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     return with_others(np.array([start, *exact, stop]), found)[1:-1]
 
 
-def with_others(known: Array, others: Array, near: float | None = None) -> Array:
+def with_others(known: Array, others: Array, near: Array | float | None = None) -> Array:
     """Times ``known`` (A,), sorted, and those ``others`` (B,) that are not so ``near`` to one.
 
     None: by more than rounding of the span between the first and the last.
@@ -222,8 +222,8 @@ def with_others(known: Array, others: Array, near: float | None = None) -> Array
     return np.union1d(known, others[~among(others, known, near)])
 
 
-def among(t: Array, times: Array, near: float) -> BoolArray:
-    """Which of t (N,) are as ``near`` as that to one of the ascending times."""
+def among(t: Array, times: Array, near: Array | float) -> BoolArray:
+    """Which of t (N,) are as ``near`` (N,) to one of the ascending times."""
     padded = np.concatenate([[-np.inf], times, [np.inf]])
     k = np.searchsorted(padded, t).clip(1)
     return np.asarray(np.minimum(t - padded[k - 1], padded[k] - t) <= near)

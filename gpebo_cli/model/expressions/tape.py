@@ -26,7 +26,7 @@ from gpebo_cli.model.expressions.syntax import Expression, shorten
 MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
 _SWITCHES = ("abs", "sign", "min", "max")
-_ASIDE = 1e-7  # of a way that is itself 1e-3 of an element: a signal hardly moves there
+_ASIDE = 1e-6  # of a way that is itself 1e-3 of an element: a signal hardly moves there
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Order, whether jumps are decided at other times, how many coefficients of how many signals.
