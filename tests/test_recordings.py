@@ -390,10 +390,25 @@ def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
     path.write_text(ELSEWHERE, newline="")
     with pytest.raises(ConfigError, match=r"line 4, column U in \(V\): the sample is missing"):
         read_table(elsewhere(path), shipped("circuit"))
-    path.write_text(ELSEWHERE.replace("1000,5", ""), newline="")
-    for missing in ("hold", "interpolate"):
-        with pytest.raises(ConfigError, match=r"line 2, column U .*none before it"):
-            read_table(elsewhere(path, missing=missing), shipped("circuit"))
+
+
+@pytest.mark.parametrize(("missing", "lines", "V"), [
+    ("hold", (3, 6), [1.0, 1.0, 2.0, 2.0]), ("interpolate", (3, 5), [1.0, 1.5, 2.0]),
+])
+def test_rows_before_all_signals_have_begun_are_left_out(tmp_path, missing, lines, V):
+    path = tmp_path / "r.csv"
+    path.write_text("t,V,y\n0,,5\n1,1,6\n2,,7\n3,2,8\n4,,9\n")
+    data = DataSettings("csv", str(path), missing=missing)
+    found = read_table(data, shipped("circuit"))
+    assert found.lines == lines
+    assert found.samples.inputs[:, 0].tolist() == V
+    assert found.samples.outputs[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0][: len(V)]
+    if missing == "hold":
+        rows, wrong = LineReader("S", data, shipped("circuit")).feed(path.read_bytes())
+        assert (wrong, [row[1] for row in rows]) == ("", V)
+    path.write_text("t,V,y\n0,,5\n1,,6\n")
+    with pytest.raises(ConfigError, match="0 rows without gaps; 2 are needed"):
+        read_table(data, shipped("circuit"))
 
 
 def test_dates_are_seconds_after_the_first(tmp_path):

@@ -22,7 +22,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import read_mat
-from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.reading import read_bytes
 from gpebo_cli.schema import LARGEST, nearest, shown
 from gpebo_cli.settings import DataSettings
@@ -288,29 +288,26 @@ def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
     return np.asarray((times - origin).total_seconds(), dtype=np.float64), origin
 
 
-def fill(
-    header: Header, data: DataSettings, values: Array, line: Sequence[int] | IntArray
-) -> Array:
-    """Rows (N, columns) without gaps, as ``data.missing`` wants it (ConfigError)."""
-    gaps = np.isnan(values)
+def _without_gaps(data: DataSettings, values: Array) -> BoolArray:
+    """Fills gaps in rows (N, columns) as ``data.missing`` wants it; which rows are kept (N,).
+
+    Signals begin one after the other where they are of different rates: rows before the last one
+    has begun are left out, and between samples those after the first one has ended.
+    """
+    there = ~np.isnan(values)
     if data.missing == "drop":
-        return np.asarray(values[~gaps.any(axis=1)])
-    for k in np.flatnonzero(gaps.any(axis=0)):
-        there = np.flatnonzero(~gaps[:, k])
-        sides = [0] if data.missing == "hold" else [0, -1]
-        for side in sides:
-            if gaps[side, k]:
-                raise ConfigError(
-                    f"{header.source}, line {line[side]}, column {header.names[k]}: the sample is "
-                    f"missing, and there is none {'before' if side == 0 else 'after'} it for "
-                    f"data.missing={data.missing}"
-                )
+        return np.asarray(there.all(axis=1))
+    kept = np.logical_or.accumulate(there).all(axis=1)
+    if data.missing == "interpolate":
+        kept &= np.logical_or.accumulate(there[::-1])[::-1].all(axis=1)
+    for k in np.flatnonzero(~there.all(axis=0) & there.any(axis=0)):
+        known = np.flatnonzero(there[:, k])
         if data.missing == "hold":
-            last = np.searchsorted(there, np.arange(len(values)), side="right") - 1
-            values[:, k] = values[there[last], k]
+            last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
+            values[:, k] = values[known[last], k]
         else:
-            values[:, k] = np.interp(values[:, 0], values[there, 0], values[there, k])
-    return values
+            values[:, k] = np.interp(values[:, 0], values[known, 0], values[known, k])
+    return np.asarray(kept)
 
 
 def samples(header: Header, values: Array, system: DescriptorSystem) -> Samples:
@@ -325,13 +322,13 @@ def _table(
     header: Header, data: DataSettings, values: Array, system: DescriptorSystem, sha256: str,
     first_line: int,
 ) -> Table:
-    line = np.arange(first_line, first_line + len(values))
-    kept = line[~np.isnan(values).any(axis=1)] if data.missing == "drop" else line
-    values = fill(header, data, values, line)
-    if len(values) < 2:
-        raise ConfigError(f"{header.source} has {len(values)} rows without gaps; 2 are needed")
+    kept = np.flatnonzero(_without_gaps(data, values))
+    if len(kept) < 2:
+        raise ConfigError(f"{header.source} has {len(kept)} rows without gaps; 2 are needed")
+    if len(kept) < len(values):
+        values = values[kept]
     found = samples(header, values, system)
-    return Table(header, found, (int(kept[0]), int(kept[-1])), sha256)
+    return Table(header, found, (first_line + int(kept[0]), first_line + int(kept[-1])), sha256)
 
 
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
@@ -493,7 +490,8 @@ class LineReader:
         if any(map(math.isnan, row)):
             if self._data.missing == "drop":
                 return
-            both = np.array([self._before, row] if self._before else [row])
-            row = fill(self.header, self._data, both, [number])[-1].tolist()
+            held = self._before or row
+            row = [held[k] if math.isnan(value) else value for k, value in enumerate(row)]
         self._before = row
-        yield row
+        if not any(map(math.isnan, row)):
+            yield row
