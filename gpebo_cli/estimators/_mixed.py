@@ -231,7 +231,7 @@ class MixedEstimates(Lasting):
         """η̂ (g, M, P) from ``start`` (P,) or (g, P) with ``gains`` (g, P or 1)."""
         each = np.broadcast_to(self.units, len(self.start))
         units = np.repeat(each, path.quotient.shape[-1] // len(each))
-        return units * scalar_law(path.comparable(units), start / units, gains)
+        return scalar_law(path, start, gains, units)
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""

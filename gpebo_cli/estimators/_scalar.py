@@ -104,14 +104,12 @@ class ScalarPath:
         """Δ at the times t (N,)."""
         return self.signals(t, t)[0]
 
-    def comparable(self, units: Array) -> ScalarPath:
+    def comparable(self, units: Array | float) -> ScalarPath:
         """The same of parameters in units (p,), in which they are comparable."""
         def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             delta, Y, digits = self.signals(t, inside)
             return delta, Y / units, digits
 
-        if (units == 1.0).all():
-            return self
         return replace(self, signals=signals, quotient=self.quotient / units)
 
 
@@ -119,26 +117,30 @@ class _UnresolvedError(Exception):
     """What η̂ follows is rounding, which no element is short enough for."""
 
 
-def scalar_law(path: ScalarPath, start: Array, gains: Array) -> Array:
+def scalar_law(
+    path: ScalarPath, start: Array, gains: Array, units: Array | float = 1.0
+) -> Array:
     """Estimates (g, M, p) at the times of the path.
 
-    From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1).
+    From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1). In
+    ``units`` (p,) parameters are comparable.
     """
     if not (path.digits > SINGULAR).any():  # nothing is known, and η̂ does not move
         wide = np.broadcast_to(start, (len(gains), start.shape[-1]))
         return wide[:, None].repeat(len(path.t), axis=1)
-    variation, size = _variation(path, float(gains.max(initial=0.0)), start)
-    if variation <= _CONSTANT * size and not _drifts(path, float(gains.max()), size):
+    seen, own = path.comparable(units), start / units
+    variation, size = _variation(seen, float(gains.max(initial=0.0)), own)
+    if variation <= _CONSTANT * size and not _drifts(seen, float(gains.max()), size):
         return constant_law(path, start, gains)
     if variation <= _SMALL * size:
         return linear_law(path, start, gains)
     elements = min(path.mesh.size, _STRETCH)
     lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
-    starts = np.broadcast_to(start, (len(gains), start.shape[-1]))
+    starts = np.broadcast_to(own, (len(gains), start.shape[-1]))
     try:
-        return np.concatenate([
-            _integrate(path, starts[i : i + batch], gains[i : i + batch])
+        return units * np.concatenate([
+            _integrate(seen, starts[i : i + batch], gains[i : i + batch])
             for i in range(0, len(gains), batch)
         ])
     except _UnresolvedError:
