@@ -15,8 +15,9 @@ from regressions import ETA, adjugate, fading, integrate, regression, three
 import gpebo_cli
 from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
+from gpebo_cli.estimators._information import information
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
@@ -225,6 +226,18 @@ def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance
     expected = np.concatenate([first, rest])[:, columns]
     found = run(name, NOISY, t, initial=START, **gains)[0]
     assert np.abs(found - expected).max() < tolerance
+
+
+def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
+    """‖F‖ of what is not excited is logistic, and z = 1/(f₀‖F‖) its reciprocal."""
+    row, f0, bound = np.array([0.6, 0.8]), 1e-4, 1e6
+    constant = regression(lambda t: np.broadcast_to(row, (*np.shape(t), 2)), ETA[:2])
+    found = information(constant, 1.0, f0, 10.0, bound)
+    points = found.memory.mesh.points
+    exact = (1.0 + (bound * f0 - 1.0) * np.exp(-10.0 * points)) / (bound * f0)
+    assert np.abs(found.memory.values / exact - 1.0).max() < 1e-6
+    with pytest.raises(SolverError, match=r"estimator\.beta = 1e\+15 .*; lower it"):
+        information(constant, 1.0, f0, 1e15, bound)
 
 
 @pytest.mark.parametrize(("alpha", "gamma2"), [(0.3, 0.0), (0.5, 0.0), (0.8, 0.0), (0.5, 1e6)])

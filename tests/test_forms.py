@@ -504,6 +504,11 @@ def test_a_plant_without_derivatives():
         assert found.regression.parameters == ("a",)
         assert np.abs(error).max() < 1e-12
         assert of_states < 1e-12
+    noisy = run(
+        plant, estimator="drem", observer={"name": "gpebo", "sample_time": 0.05},
+        noise={"name": "gaussian", "outputs": 0.01}, time={"horizon": 5},
+    )
+    assert abs(noisy.estimates["a"][0, -1] - 0.5) < 0.05
 
 
 def test_the_horizon_does_not_change_the_past():

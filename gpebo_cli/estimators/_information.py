@@ -18,9 +18,10 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.errors import SolverError, check_memory
-from gpebo_cli.estimators._scalar import SINGULAR, low_pass
+from gpebo_cli.estimators._scalar import MAX_ELEMENTS, SINGULAR, low_pass
 from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -186,7 +187,13 @@ def _bounded(
     outer = regression.outer
     mesh = outer.mesh
     longest = 0.25 / beta0
-    parts = np.maximum(1, np.ceil(mesh.steps / longest)).astype(np.intp)
+    parts = np.maximum(1.0, np.ceil(mesh.steps / longest))
+    if parts.sum() > MAX_ELEMENTS:
+        raise SolverError(
+            f"estimator.beta = {beta0:.6g} 1/s with a bound asks for {parts.sum():.3g} elements of "
+            f"{longest:.3g} s, and at most {MAX_ELEMENTS} are made; lower it"
+        )
+    parts = parts.astype(np.intp)
     if (parts > 1).any():
         mesh, _ = mesh.split(parts)
         outer = mesh.along(outer)
@@ -204,11 +211,12 @@ def _bounded(
             decay = np.exp(-h * (R @ beta))[:, None, None]  # z(t_i)/z(left)
             nodes = decay * (G + h * np.tensordot(R, added / decay, axes=1))
             inverse = z * decay * eye + alpha * nodes[..., :p]
-            size = 1.0 / np.linalg.eigvalsh(inverse)[:, 0]
-            update = beta0 * (1.0 - size / bound)
-            change = float(np.abs(update - beta).max())
-            beta = update
-            if change <= 1e-13 * beta0:
+            eigenvalues = np.linalg.eigvalsh(inverse)
+            update = beta0 * (1.0 - 1.0 / (bound * eigenvalues[:, 0]))
+            change, beta = np.abs(update - beta) / beta0, update
+            # What is not excited is forgotten down to the bound, beside what is.
+            rounding = 4.0 * EPS * eigenvalues[:, -1] / eigenvalues[:, 0]
+            if (change <= np.clip(rounding, 1e-13, 1e-6)).all():
                 break
         else:
             raise SolverError(

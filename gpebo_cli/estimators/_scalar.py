@@ -30,7 +30,7 @@ MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 # the second as linear in I between neighbouring points, which is then accurate enough.
 _CONSTANT, _SMALL = 1e-13, 1e-8
 _TOLERANCE = 1e-10
-_MAX_ELEMENTS = 20_000
+MAX_ELEMENTS = 20_000
 _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
@@ -254,7 +254,7 @@ def _resolved(
         if not poor.any():
             return mesh, values
         parts = wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages)
-        if parts.sum() > _MAX_ELEMENTS:
+        if parts.sum() > MAX_ELEMENTS:
             raise _UnresolvedError
         finer, kept = mesh.split(parts)
         ends, new = np.repeat(ends, parts, axis=0), kept < 0

@@ -287,7 +287,8 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
         A, B = (x / size[:, None, :, None] for x in (A, B))
         E = (np.eye(A.shape[-1]) / size[:, None]).repeat(1 + A.shape[1], axis=0)
     # At the left ends nothing is looked at.
-    A, B = (np.concatenate([x[:, :1], x], axis=1).reshape(-1, *x.shape[2:]) for x in (A, B))
+    A, B = (np.concatenate([x[:, :1], x], axis=1) for x in (A, B))
+    A, B = (x.reshape(K * x.shape[1], *x.shape[2:]) for x in (A, B))
     return np.concatenate(elements.element_maps(
         mesh.rule.differentiation, steps, E, A, B, None, None, np.arange(K), K
     ), axis=3)
