@@ -240,6 +240,14 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
         information(constant, 1.0, f0, 1e15, bound)
 
 
+@pytest.mark.parametrize("name", ["least_squares", "ls_drem", "fct"])
+def test_what_is_not_excited_stays_where_it_was_however_fast_it_is_forgotten(name):
+    blind = regression(lambda t: np.zeros((*np.shape(t), 3)), ETA, elements=4)
+    extension = {"extension": "least_squares"} if name == "fct" else {}
+    found = run(name, blind, beta=[0, 1, 1e8], initial=START, **extension)
+    assert np.abs(found - START).max() < 1e-14
+
+
 @pytest.mark.parametrize(("alpha", "gamma2"), [(0.3, 0.0), (0.5, 0.0), (0.8, 0.0), (0.5, 1e6)])
 def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2):
     """|e|^{1−α} = |e(0)|^{1−α} − γ(1 − α)∫|Δ|^{1+α}; the second power only hurries."""

@@ -28,6 +28,7 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, level_of
 
 _PICARD_ROUNDS = 200
+_FORGOTTEN = 1e-200  # z that makes no difference to anything any more
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
@@ -168,7 +169,8 @@ def information(
         # β ∫ e^{−β(t−s)} (·) ds
         filtered = low_pass(regression.outer, np.array(beta), start)
         mesh = filtered.mesh
-        memory = before * np.exp(-beta * (mesh.points - mesh.edges[0]))
+        # Never 0, beside which what is not excited has a share of 0/0.
+        memory = np.maximum(before * np.exp(-beta * (mesh.points - mesh.edges[0])), _FORGOTTEN)
         return Information(
             Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory), level
         )
