@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
@@ -119,12 +120,17 @@ class LinearRegression:
 
     @cached_property
     def gram_final(self) -> Array:
-        """[G | h] at the end, (p, p + c)."""
+        """[G | h] at the end, (p, p + c) (SolverError: squares are beyond all numbers)."""
         if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
             rows = (window._weighted() for window in self.windows())  # noqa: SLF001
-            return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
-        for part in self.gram_parts():
-            final = part.final
+            final = np.asarray(sum(own[:, : self.p].T @ own for own in rows))
+        else:
+            for part in self.gram_parts():
+                final = part.final
+        if not np.isfinite(final).all():
+            raise SolverError(
+                "squares of Y and ψ are beyond all numbers; write them in larger units"
+            )
         return final
 
     def gram_at(self, t: Array) -> Array:
