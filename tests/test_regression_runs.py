@@ -183,14 +183,16 @@ def test_a_measured_Y_is_compared_with_the_fitted_one(wrong, name):
         assert found.to_pandas("estimates")["a_std"].iloc[-1] == pytest.approx(std, rel=0.1)
 
 
-@pytest.mark.parametrize("estimator", ["drem", "annihilator", "instrumental", "power"])
+@pytest.mark.parametrize("estimator", [
+    "drem", "annihilator", "instrumental", "power", "least_squares", "ls_drem",
+])
 def test_squares_that_no_number_holds_are_refused_with_their_time(estimator):
     """ψ ends at e^700, which is a number, and its square is none."""
     given = {
         "name": "huge", "unknowns": {"a": 1.5}, "signals": {"u": "sin(t)"}, "Y": [0, "u"],
         "psi": [["exp(700*t)"], [0]],
     }
-    with pytest.raises(SolverError, match=r"^Ω.* is too large for a number near t = 0\.\d+; write"):
+    with pytest.raises(SolverError, match=r"is too large for a number near t = 0\.\d+; write"):
         run(regression=given, estimator=estimator, time={"horizon": 1, "samples": 11})
 
 
@@ -206,3 +208,13 @@ def test_a_narrow_pulse_is_seen_wherever_it_stands(psi):
                 time={"horizon": 10})
     assert found.details.excitation.is_ie
     assert found.estimates["b"].ravel()[-1] == pytest.approx(2.0, rel=1e-4)
+
+
+def test_a_start_beyond_all_numbers_is_refused_in_one_line():
+    content = {
+        "name": "mine", "states": ["x"], "inputs": {"u": "sin(t)"}, "unknowns": {"th": 1.5},
+        "outputs": ["y", "z"], "E": [[1]], "A": [[1]], "B": [[16]], "F": [[2.5]],
+        "C": [[1e-300], [1]], "initial_state": {"x": 1},
+    }
+    with pytest.raises(SolverError, match="beyond all numbers at t = 0"):
+        run(content, solver="ivp", time={"horizon": 1, "samples": 11})

@@ -120,18 +120,19 @@ class LinearRegression:
 
     @cached_property
     def gram_final(self) -> Array:
-        """[G | h] at the end, (p, p + c) (SolverError: squares are beyond all numbers)."""
+        """[G | h] at the end, (p, p + c) (SolverError: squares are too large for numbers)."""
         if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
             rows = (window._weighted() for window in self.windows())  # noqa: SLF001
-            final = np.asarray(sum(own[:, : self.p].T @ own for own in rows))
-        else:
-            for part in self.gram_parts():
-                final = part.final
-        if not np.isfinite(final).all():
-            raise SolverError(
-                "squares of Y and ψ are beyond all numbers; write them in larger units"
-            )
-        return final
+            return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
+        for part in self.gram_parts():
+            known = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
+            if not known.all():
+                t = part.mesh.edges[np.argmin(known)]
+                raise SolverError(
+                    f"∫ψᵀψ is too large for a number near t = {t:.4g}; write Y and ψ in larger "
+                    "units"
+                )
+        return part.final
 
     def gram_at(self, t: Array) -> Array:
         """[G | h] at the times t (M,), (M, p, p + c)."""

@@ -128,6 +128,10 @@ def _sample(
         left, right = mesh.edges[first], mesh.edges[last]
         if first and float(left) in restarts:
             state = restarts[float(left)](state)
+        if not np.isfinite(state).all():
+            raise SolverError(
+                f"solver=ivp: the {problem.name} is beyond all numbers at t = {left:.6g}"
+            )
         margin = 1e-9 * (right - left)
 
         def derivative(
