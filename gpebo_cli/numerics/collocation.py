@@ -45,7 +45,7 @@ from gpebo_cli.numerics.refinement import refine
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
-_AMPLIFIED = 1e-9  # errors beyond that are looked at once more
+_AMPLIFIED = 1e-9  # errors beyond that, and a thousand tails, are looked at once more
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
@@ -112,7 +112,7 @@ def solve(
     errors = estimated_errors(
         problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
     )
-    if errors.lost == mesh.size and errors.estimate > _AMPLIFIED:
+    if errors.lost == mesh.size and errors.estimate > max(_AMPLIFIED, 1e3 * left):
         other = _rounded_otherwise(problem, mesh, values, restarts or {})
         errors = errors._replace(largest=np.maximum(errors.largest, other))
     if problem.missed is not None:
