@@ -155,15 +155,15 @@ def _solved(
         least = largest_over_time(C, 2) @ least
         return [(u, SHARE * terms(size)), (y, least)]
 
-    # Where the constraints leave nothing of the state asked for, its rounding is no signal.
-    floor = SHARE * np.abs(system.initial_state)
-    if structure.a:
-        floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
     def missed(mesh: Mesh, values: Array) -> Array:
         some = slice(None, None, -(-mesh.size // _LOOKED_AT))
         at = mesh.points[some, -1], mesh.inside[some, -1]
         return shown_rounding(system, structure, *at, values[some, -1])
 
+    # Where the constraints leave nothing of the state asked for, its rounding is no signal.
+    floor = SHARE * np.abs(system.initial_state)
+    if structure.a:
+        floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
     units = structure.scaling.columns[:, None]
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
