@@ -228,6 +228,15 @@ def test_an_ideal_transformer():
     assert result["y_it1"][-1] == pytest.approx(0.125)  # 0.5 A through R1, divided by the ratio
 
 
+@pytest.mark.parametrize(("text", "measure", "value"), [
+    ("V1 a 0 2\nR1 a 0 1\nH1 a 0 V1 -5", "i(V1)", -0.4),
+    ("I1 0 a 1m\nG1 a b a b 1m\nG2 b 0 b 0 2m", "v(a)", 1.5),
+], ids=["across a source", "conductances"])
+def test_what_is_controlled_may_determine_a_loop_or_a_cutset(text, measure, value):
+    plant = plant_of(f"t\n{text}\n", measure=measure)
+    assert simulated(plant)[plant["outputs"][0]][-1] == pytest.approx(value, rel=1e-12)
+
+
 def test_an_unknown_source_is_estimated():
     text = "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1k\nC1 b 0 1m ic=0.2\nI5 b 0 2u\n"
     result = run(plant_of(text, measure="v(b)", unknown="I5"), estimator="ls_drem")

@@ -73,7 +73,7 @@ def circuit_from_netlist(
 def examine(netlist: Netlist, file: str) -> Topology:
     """Loops and cutsets that raise the index.
 
-    A floating node, a loop of voltage sources or a cutset of current sources is a ConfigError.
+    A floating node, a loop or a cutset of independent sources alone is a ConfigError.
     """
     from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
 
@@ -97,18 +97,19 @@ def examine(netlist: Netlist, file: str) -> Topology:
             f"{file}: no path leads from node {floating[0]} to ground; connect it, through a large "
             "resistor for instance"
         )
+    # What is controlled may still be determined by what controls it: the plant's analysis decides.
     fixed = DisjointSet(nodes)  # by sources alone: their loops have no unique current
     for e in branches:
-        if e.kind in "VEH":
-            a, b = e.nodes[:2]
+        if e.kind == "V":
+            a, b = e.nodes
             if not fixed.merge(a, b):
                 raise e.place.error(
                     f"{e.name} closes a loop of voltage sources, or is shorted; its current would "
                     "be anything"
                 )
-    carried = joined("IGF")
+    carried = joined("I")
     for e in branches:
-        if e.kind in "IGF" and not carried.connected(*e.nodes[:2]):
+        if e.kind == "I" and not carried.connected(*e.nodes):
             raise e.place.error(
                 f"{e.name} drives a current that can flow back through current sources only; its "
                 "voltage would be anything"
