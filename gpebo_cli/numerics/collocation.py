@@ -19,7 +19,7 @@ so T need not be smooth in time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 
@@ -28,7 +28,7 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.errors import CHANCE, EPS, estimated_errors, least_sizes, nothing_left
+from gpebo_cli.numerics.errors import CHANCE, estimated_errors, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import (
     Looked,
@@ -45,7 +45,6 @@ from gpebo_cli.numerics.refinement import refine
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
-_AMPLIFIED = 1e-9  # errors beyond that, and a thousand tails, are looked at once more
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
@@ -112,9 +111,6 @@ def solve(
     errors = estimated_errors(
         problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
     )
-    if errors.lost == mesh.size and errors.estimate > max(_AMPLIFIED, 1e3 * left):
-        other = _rounded_otherwise(problem, mesh, values, restarts or {})
-        errors = errors._replace(largest=np.maximum(errors.largest, other))
     if problem.missed is not None:
         shown = CHANCE * problem.missed(mesh, values)
         errors = errors._replace(largest=np.maximum(errors.largest, shown))
@@ -125,26 +121,6 @@ def solve(
         None if errors.lost == mesh.size else float(mesh.edges[errors.lost + 1]), tuple(extras),
         errors.last, None if problem.units is None else errors.vague(tol),
     )
-
-
-def _rounded_otherwise(
-    problem: LinearProblem, mesh: Mesh, values: Array,
-    restarts: Mapping[float, Callable[[Array], Array]],
-) -> Array:
-    """Errors (n, columns) seen by solving again with coefficients at times a rounding away.
-
-    What rounding does to the elimination of constraints no bound tells closely: an equation may be
-    made of large terms that cancel, and show nothing of them.
-    """
-    away = EPS * float(mesh.edges[-1] - mesh.edges[0])
-
-    def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return problem.coefficients(t + away, inside)
-
-    maps = _element_maps(replace(problem, coefficients=coefficients), mesh, None)
-    other, _ = _chain(maps, problem, mesh, restarts)
-    found = CHANCE * np.abs(other - values).max(axis=(0, 1))
-    return np.where(np.isfinite(found), found, np.inf)
 
 
 def _not_finite(
@@ -319,8 +295,8 @@ def _solve_elements(
 def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     """By how much relative rounding of each component, and of 1, may move X within an element.
 
-    h times what T brings of |A| and |f|; and what rounding of the times t (k, s + 1) makes of A and
-    f that move. Shape (k, n, n + columns); zero where E is not invertible.
+    h times what T brings of |A| and |f|, or of their terms; and what rounding of the times t (k, s
+    + 1) makes of A and f that move. Shape (k, n, n + columns); zero where E is not invertible.
     """
     k, s = len(h), t.shape[1] - 1
     d, n = c.A.shape[1:]
@@ -329,7 +305,8 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     whole[..., :n] = at_points(c.A, k, s).swapaxes(0, 1)
     whole[..., n:] = at_points(c.f, k, s).swapaxes(0, 1)
     high, low = whole.max(axis=0), whole.min(axis=0)
-    found = h[:, None, None] * np.maximum(high, -low)
+    found = np.maximum(high, -low)
+    found = h[:, None, None] * (found if c.terms is None else np.maximum(found, c.terms))
     found += np.abs(t[:, -1, None, None]) * (high - low)
     if c.constraints is not None:
         return np.asarray(largest_within(at_points(c.constraints.basis, k, s)) @ found)

@@ -28,6 +28,8 @@ class LinearEquation(NamedTuple):
     f: Array  # (N, n or d, columns)
     extras: tuple[Array, ...] = ()  # (N, ...) each: whatever the monitor needs at these times
     constraints: Constraints | None = None
+    # (K or 1, d, n + columns or 1) what [A f] are the difference of, at the end of each element
+    terms: Array | None = None
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind

@@ -57,15 +57,18 @@ class StrangenessFree:
     u: Array  # (N, m) the inputs and
     C: Array  # (N or 1, r, n) the output matrix at the same times
     direct: Array | None  # (N, r) D u + H θ, what the state has no part in; None: nothing
+    # What A1 and f1 are the sum of, at the last of so many times as were asked for.
+    terms: Array | None  # (M, d, n + 1) sizes; None: none were asked for
 
 
 def strangeness_free_form(
     system: DescriptorSystem, structure: Structure, t: Array, inside: Array,
-    c: Coefficients | None = None,
+    c: Coefficients | None = None, points: int = 0,
 ) -> StrangenessFree:
     """The strangeness-free equations at the times t (N,), one sweep over all of them.
 
-    ``c`` are the model's coefficients there to the order μ, where they are at hand.
+    ``c`` are the model's coefficients there to the order μ, where they are at hand; at the last of
+    so many ``points`` each, terms are looked at.
 
     Elimination on the pivots of one reference time where that is well conditioned, singular
     vectors at the times where it is not.
@@ -96,8 +99,19 @@ def strangeness_free_form(
             *model[:2], every,
         )
     E1, A1, f1, A2, f2, basis, offset, amplification = found
+    terms = None
+    if points:
+        e, T, a, b, f, u, v = (
+            x if len(x) == 1 else x[points - 1 :: points]
+            for x in (E[0], basis, A[0], c.B[0], F[0], c.u[0], theta[0])
+        )
+        # The equations are those of the rows (E T)ᵀ, because it has orthonormal columns.
+        W1 = np.abs(transpose(e @ T) * scaling.rows**2)
+        f = np.abs(b) @ np.abs(u)[:, :, None] + np.abs(f) @ np.abs(v)[:, :, None]
+        terms = W1 @ joined(np.abs(a), f, axis=2)
     return StrangenessFree(
-        E1, A1, f1, A2, f2, basis, offset, amplification, E[0], c.u[0], distinct(c.C)[0], direct
+        E1, A1, f1, A2, f2, basis, offset, amplification, E[0], c.u[0], distinct(c.C)[0], direct,
+        terms,
     )
 
 

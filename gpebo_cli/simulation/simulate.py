@@ -121,7 +121,10 @@ def _solved(
     """:func:`_simulate_linear` of a plant with this structure."""
     start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
-    first = strangeness_free_form(system, structure, mesh.points.ravel(), mesh.inside.ravel(), c)
+    points = len(mesh.rule.points)
+    first = strangeness_free_form(
+        system, structure, mesh.points.ravel(), mesh.inside.ravel(), c, points
+    )
     independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
     if independent:
         x0 = ivp.consistent_start(system, structure, start, float(mesh.inside[0, 0]))
@@ -137,7 +140,7 @@ def _solved(
     restarts = _restarts(system, structure, cuts, mesh.edges, happened)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return _equations(strangeness_free_form(system, structure, t, inside))
+        return _equations(strangeness_free_form(system, structure, t, inside, points=points))
 
     def explicit(t: Array, inside: Array) -> LinearEquation:
         A, f = ivp.underlying_ode(system, structure, t, inside)
@@ -284,9 +287,9 @@ def _equations(reduced: StrangenessFree) -> LinearEquation:
     extras = tuple(e for e in (reduced.u, reduced.C, reduced.direct) if e is not None)
     f1 = reduced.f1[:, :, None]
     if not reduced.A2.shape[1]:
-        return LinearEquation(reduced.E1, reduced.A1, f1, extras)
+        return LinearEquation(reduced.E1, reduced.A1, f1, extras, None, reduced.terms)
     constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
-    return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints)
+    return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints, reduced.terms)
 
 
 def _restarts(
