@@ -147,8 +147,8 @@ static void run_cell(const Call *call, Interval *row, char *number)
         const Interval found = image(operation->what, a, b, left == right && left >= 0);
         const double middle = found.low + 0.5 * (found.high - found.low);
         const int one = (left < 0 || number[left]) && (right < 0 || number[right]);
-        number[operation->result] = one && isfinite(middle);
-        row[operation->result] = one && isfinite(middle) ? (Interval){middle, middle} : found;
+        number[GIVEN + k] = one && isfinite(middle);
+        row[GIVEN + k] = number[GIVEN + k] ? (Interval){middle, middle} : found;
     }
 }
 
@@ -181,6 +181,6 @@ static Outcome intervals(Call *call)
 }
 
 const Kernel interval_kernels[] = {
-    {"intervals", "N N N @v4 c @oj", "oNj oNj", intervals},
+    {"intervals", "N N N @v3 c @oj", "oNj oNj", intervals},
     {NULL, NULL, NULL, NULL},
 };

@@ -53,12 +53,12 @@ static inline const double *row_of(const Rows *rows, npy_intp index)
             z[i] = value;                                                                          \
     } while (0)
 
-/* Does one operation for `count` times. The C library computes functions one value at a time;
-   sines of several at once would be ten times faster, and ours to answer for. */
-EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, npy_intp count)
+/* Does one operation for `count` times, into z. The C library computes functions one value at a
+   time; sines of several at once would be ten times faster, and ours to answer for. */
+EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, double *restrict z,
+                                npy_intp count)
 {
     const npy_intp left = operation->left, right = operation->right;
-    double *restrict z = rows->memory + (operation->result - rows->first) * rows->length;
     switch (operation->what) {
     case ADD: BINARY(+); break;
     case SUBTRACT: BINARY(-); break;
@@ -91,21 +91,15 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, np
 npy_intp rows_used(const Operation *operation, npy_intp count, npy_intp given, npy_intp constants)
 {
     npy_intp rows = given;
-    for (npy_intp k = 0; k < count; k++, operation++) {
+    for (; rows < given + count; rows++, operation++) {
         const npy_intp what = operation->what, left = operation->left, right = operation->right;
         if (what < 0 || what >= OPERATIONS)
             return no_such("operations", what);
-        if (operation->result < given || operation->result > rows)
-            return no_such("rows", operation->result);
         const int unary = what >= NEGATIVE, constant = what == POWER || what == GREATER_EQUAL;
         if (left >= rows || left < -constants || (left < 0 && (unary || constant || right < 0)))
             return no_such("left operands", left);
         if (!unary && (right >= rows || right < -constants || (constant && right >= 0)))
             return no_such("right operands", right);
-        if (operation->result == left || (!unary && operation->result == right))
-            return no_such("rows to write to while they are read", left);
-        if (operation->result == rows)
-            rows++;
     }
     return rows;
 }
@@ -211,7 +205,8 @@ static int fill_matrices(const Call *call, Rows *rows, double *const *out)
         rows->given[1] = call->in[1] + first;
         rows->signals = call->in[2] + first;
         for (npy_intp k = 0; k < SIZE(v); k++)
-            operate(rows, (const Operation *)call->index[3] + k, here);
+            operate(rows, (const Operation *)call->index[3] + k, rows->memory + k * rows->length,
+                    here);
         const npy_intp *target = call->index[6];
         for (npy_intp j = 0; j < outputs; j++, target += 2) {
             const npy_intp entries = PyArray_SIZE(call->array[FIRST + target[0]]) / orders;
@@ -252,6 +247,6 @@ static Outcome jets(Call *call)
 }
 
 const Kernel jet_kernels[] = {
-    {"jets", "N N xN @v4 c @oj @j2 *", NULL, jets},
+    {"jets", "N N xN @v3 c @oj @j2 *", NULL, jets},
     {NULL, NULL, NULL, NULL},
 };

@@ -11,13 +11,13 @@ enum { ADD, SUBTRACT, MULTIPLY, DIVIDE, POWER, GREATER_EQUAL, BINARY_OPERATIONS 
 enum { NEGATIVE = BINARY_OPERATIONS, SQRT, EXP, LOG, SIN, COS, TAN, SINH, COSH, TANH, ASIN };
 enum { ACOS = ASIN + 1, ATAN, ASINH, ACOSH, ATANH, ERF, ABSOLUTE, SIGN, OPERATIONS };
 
-/* One operation: what, the row of its result, its operands; see `operand`. */
+/* One operation: what, and its operands, rows or constants as ~index; it makes the next row. */
 typedef struct {
-    npy_intp what, result, left, right;
+    npy_intp what, left, right;
 } Operation;
 
-/* How many rows the operations use, those given included; 0 with an exception if they are none
-   that can be run. */
+/* How many rows there are with those given; 0 with an exception if the operations are none that
+   can be run. */
 npy_intp rows_used(const Operation *operation, npy_intp count, npy_intp given, npy_intp constants);
 
 /* Whether results (count,) are rows or constants that there are. */

@@ -74,9 +74,9 @@ class Recorder:
 
 
 class Program(NamedTuple):
-    """Operations on rows. The first ones are given; a constant stands as ~index for a row."""
+    """Operations on rows; each makes one more, after those given. Constants stand as ~index."""
 
-    code: IntArray  # (number, 4) operation, row of its result, left and right operand
+    code: IntArray  # (number, 3) operation, left and right operand
     constants: Array  # (number,)
     results: IntArray  # (order + 1, outputs) the rows of the coefficients
 
@@ -85,51 +85,15 @@ def finished(recorder: Recorder, places: Sequence[list[Any]], outputs: Iterable[
              ) -> Program:
     """The program of a recording whose tape has these jets at its places.
 
-    What contributes to no jet of any place is left out; all the rest is kept, also what no output
-    needs: it may turn out not to be finite. Rows are used again once they are read no more.
+    What no output needs is done as well: it may turn out not to be finite.
     """
     final = [
-        [recorder.operand(jet[k]) if k < len(jet) else recorder.operand(0.0)
+        [recorder.operand(jet[k] if k < len(jet) else 0.0)
          for jet in (places[place] for place in outputs)]
         for k in range(order + 1)
     ]  # fmt: skip
-    operations, given = list(recorder.rows), recorder.given
-    last = [-1] * (given + len(operations))  # the operation that reads a row last
-    kept = [False] * len(last)
-    for jet in places:
-        for coefficient in jet:
-            if isinstance(coefficient, Row):
-                kept[coefficient.index] = True
-    for number in reversed(range(len(operations))):
-        if kept[given + number]:
-            for operand in operations[number][1:]:
-                if operand >= 0:
-                    kept[operand] = True
-                    last[operand] = max(last[operand], number)
-    for operand in (operand for one in final for operand in one if operand >= 0):
-        last[operand] = len(operations)
-
-    free: list[int] = []
-    row_of = {k: k for k in range(given)}
-    code: list[tuple[int, int, int, int]] = []
-    rows = given
-    for number, (operation, left, right) in enumerate(operations):
-        index = given + number
-        if not kept[index]:
-            continue
-        # Taken before the operands are free: no operation writes where it reads.
-        if free:
-            row_of[index] = free.pop()
-        else:
-            row_of[index], rows = rows, rows + 1
-        code.append((operation, row_of[index], row_of.get(left, left), row_of.get(right, right)))
-        free += [row_of[old] for old in {left, right} if old >= given and last[old] == number]
-        if last[index] < 0:
-            free.append(row_of[index])
     return Program(
-        np.array(code, dtype=np.intp).reshape(-1, 4),
+        np.array(list(recorder.rows), dtype=np.intp).reshape(-1, 3),
         np.array(list(recorder.constants), dtype=float),
-        np.array([[row_of.get(x, x) for x in one] for one in final], dtype=np.intp).reshape(
-            order + 1, -1
-        ),
+        np.array(final, dtype=np.intp).reshape(order + 1, -1),
     )

@@ -30,7 +30,6 @@ from gpebo_cli.observers.reduced.split import comparable, units_along
 from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem, measured
 from gpebo_cli.simulation import ivp
 
-_ROOM = 1.1  # times what elements that are not cut take
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
 
 
@@ -124,7 +123,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         return _assembled(reduced, _in_units(marched, units), monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
-        return joined(_over(mesh, reduced, problem, monitor), mesh.size)
+        return joined(_over(mesh, reduced, problem, monitor))
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
     solution = own(problem, mesh, **limits)
     return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
@@ -195,25 +194,24 @@ def _over(
         yield part if asked is None else part.kept_at(own)
 
 
-def joined(parts: Iterable[Extension], elements: int) -> Extension:
-    """One extension of those on neighbouring meshes, of about so many elements in all."""
-    whole, rest = dict[str, _Filled](), list[tuple[Any, ...]]()
+def joined(parts: Iterable[Extension]) -> Extension:
+    """One extension of those on neighbouring meshes."""
+    pieces, rest = dict[str, list[Array]](), list[tuple[Any, ...]]()
     for part in parts:
         found = part.assembled
-        pieces = {
-            "edges": part.mesh.edges[:-1], "scale": part.scale, "z": part.trajectory.values,
-            **({} if part.asked is None else {"asked": part.asked}),
-            **{name: getattr(found, name) for name in OVER_TIME},
-        }
-        for name, piece in pieces.items():
-            if name not in whole:
-                whole[name] = _Filled(piece, elements / part.mesh.size)
-            whole[name].add(piece)
+        for name, piece in (
+            ("edges", part.mesh.edges[:-1]), ("scale", part.scale), ("z", part.trajectory.values),
+            ("asked", part.asked), *((name, getattr(found, name)) for name in OVER_TIME),
+        ):
+            pieces.setdefault(name, []).append(piece)
         rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
                      found.largest, found.moving))
-    whole["edges"].add(part.mesh.edges[-1:])
+    pieces["edges"].append(part.mesh.edges[-1:])
     errors, weak, of_Y, of_columns, largest, moving = zip(*rest, strict=True)
-    over_time: dict[str, Any] = {name: filled.values for name, filled in whole.items()}
+    if part.asked is None:
+        del pieces["asked"]
+    # One after the other, so that little of it is held twice.
+    over_time: dict[str, Any] = {name: np.concatenate(pieces.pop(name)) for name in [*pieces]}
     mesh = Mesh(over_time.pop("edges"), part.mesh.rule)
     z, scale, asked = over_time.pop("z"), over_time.pop("scale"), over_time.pop("asked", None)
     return Extension(
@@ -226,27 +224,6 @@ def joined(parts: Iterable[Extension], elements: int) -> Extension:
         ),
         np.maximum.accumulate(scale, axis=0), part.units, min(weak), asked,
     )
-
-
-class _Filled:
-    """Pieces in one array, in which there is room for them, so that none is held twice."""
-
-    def __init__(self, first: Array, times: float) -> None:
-        self._room = np.empty((int(_ROOM * times * len(first)) + 1, *first.shape[1:]))
-        self._stop = 0
-
-    def add(self, piece: Array) -> None:
-        """One more piece (N, …)."""
-        start, self._stop = self._stop, self._stop + len(piece)
-        if self._stop > len(self._room):
-            more = np.empty((self._stop - start + start // 4, *piece.shape[1:]))
-            self._room = np.concatenate([self._room[:start], more])
-        self._room[start : self._stop] = piece
-
-    @property
-    def values(self) -> Array:
-        """All that was added."""
-        return self._room[: self._stop]
 
 
 def _assembled(

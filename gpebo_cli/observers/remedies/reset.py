@@ -84,7 +84,7 @@ class Resets:
             resets.append(replace(reset, keep=self.keep))
             known = known.after(resets[-1])
             later.append((time, begin.dual, begin.dual @ xi_a))
-        segments = joined(extensions, sum(each.mesh.size for each in extensions))
+        segments = joined(extensions)
         growth, logarithms = zip(*(e.growth(reduced.system.q) for e in extensions), strict=True)
         at_start = reduced.begin.dual
         truth = InitialError(
