@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +23,14 @@ from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy, doubts
-from gpebo_cli.experiment.assumptions import Observed, visible, warnings
+from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.memory import check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.pace import Pace
-from gpebo_cli.experiment.result import EstimationResult, Fit, NoiseStatistics, RegressionResult
+from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
@@ -38,6 +40,7 @@ from gpebo_cli.experiment.uncertainty import (
     sampled_deviations,
     standard_deviations,
 )
+from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
@@ -56,30 +59,12 @@ _BATCH = 1 << 21  # numbers held at once while cases are evaluated: beyond it ca
 Stage = Callable[[str], AbstractContextManager[Pace]]
 
 
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """What observer and estimator made of a source."""
-
-    observed: Observed
-    regression: RegressionResult
-    excitation: Excitation
-    estimation: EstimationResult
-    metrics: Metrics
-    fit: Fit | None  # of a recording
-    # From when on each parameter and state can be known, None: never; or how that is found,
-    estimable: Mapping[str, float | None] | Callable[[], Mapping[str, float | None]]
-    unknown: Sequence[str]  # and of which it is never.
-    left_out: tuple[str, ...] = ()  # states that the observer does not estimate
-    noise: NoiseStatistics | None = None
-    by_observer: bool = False  # the observer estimates by itself
-    note: str = ""  # what the last line of a run has to say of it, from "; " on
-
-
 def continuous(
-    settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
-    observer: Observer, estimator: estimators.Estimator, stage: Stage,
-) -> Estimated:
-    """Observer and estimator as differential equations (SolverError)."""
+    result: RunResult, source: Source, levels: NoiseLevels, observer: Observer,
+    estimator: estimators.Estimator, stage: Stage,
+) -> RunResult:
+    """The result with observer and estimator as differential equations (SolverError)."""
+    settings, system = result.settings, result.system
     t, goes_on = source.t, estimators.goes_on(estimator)
 
     def observe(signals: Source | Signals) -> Observation:
@@ -116,10 +101,6 @@ def continuous(
         told = dict(zip(system.states, seen[-1], strict=True))
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
         estimator = estimators.tuned(estimator, regression)
-
-        def times() -> dict[str, float | None]:
-            return estimable(excitation.known, t, *names, seen_at(excitation.known))
-
         try:
             used, estimation, metrics = _estimate(
                 settings, system, observation.estimator or estimator, observation, source, known,
@@ -128,14 +109,12 @@ def continuous(
             estimator = estimator if observation.estimator else used
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
-    noisy = bool(source.recording) or not levels.silent
-    note = observation.note
-    if noisy or observation.estimator is not None:
+    why = ""
+    if source.noisy(levels) or observation.estimator is not None:
         with stage("uncertainty"):
             estimation, why = _with_deviations(
                 settings, observation, estimator, source, levels, known, estimation
             )
-        note += _no_deviations(why)
     fit = fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty and not levels.silent:
         fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
@@ -146,18 +125,54 @@ def continuous(
             noise = over_seeds(
                 observation, observe, source.true, theta, estimator, settings.noise, levels, pace
             )
+    unknown = [
+        name for name, is_known in told.items() if not (is_known or name in observation.unseen)
+    ]
+    return _completed(
+        result, source, observation, unknown, excitation, estimation, metrics,
+        _gains(observation, estimation) if source.noisy(levels) else None, _no_deviations(why),
+        noisy=source.noisy(levels), regression=sampled, fit=fit, noise=noise,
+        left_out=observation.unseen,
+        estimable=lambda: estimable(excitation.known, t, *names, seen_at(excitation.known)),
+        # What the result is labelled with is what estimated.
+        settings=replace(settings, estimator={"name": settings.observer["name"]})
+        if observation.estimator is not None else settings,
+    )
+
+
+def _completed(
+    result: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
+    excitation: Excitation, estimation: EstimationResult, metrics: Metrics, gains: Array | None,
+    note: str, *, noisy: bool, **more: Any,
+) -> RunResult:
+    """The result with what observer and estimator made of a source, and what is told of it.
+
+    Nothing is known of the ``unknown`` parameters and states, ``gains`` are as of
+    ``accuracy.standing``, and the ``note`` is for the last line of a run, from "; " on.
+    """
     if noisy:
-        metrics = accuracy.standing(
-            estimation, metrics, _gains(observation, estimation), system, noise
-        )
-    return Estimated(
-        observation, sampled, excitation, estimation, metrics,
-        fit, times, [
-            name for name, is_known in told.items()
-            if not (is_known or name in observation.unseen)
-        ],
-        observation.unseen, noise,
-        observation.estimator is not None, note,
+        seeds = more.get("noise")
+        metrics = accuracy.standing(estimation, metrics, gains, result.system, seeds)
+    result = replace(
+        result, excitation=excitation, estimation=estimation, metrics=metrics, **more
+    )
+    # A result that is kept for what it has to tell must not keep what the observer made.
+    of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
+    of_observer = partial(
+        of_observation, observed.assumptions, growth, excitation, result.system
+    )
+    warned, told = warnings(observed), partial(
+        verdict, excitation, estimation.cases, estimation.requirement, metrics, result.fit,
+        unknown, result.left_out, estimation.active,
+    )
+    simulation, recording = result.simulation, result.recording
+    notes = observed.note + note + simulation_note(simulation, result.settings.solver.tol)
+    notes += functions_note(result.system, simulation or recording)
+    notes += recording.note if recording else ""
+    return replace(
+        result, assumptions=lambda: (*of_source(), *of_observer()),
+        verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
+        warnings=lambda: (*warned, *estimation.warnings),
     )
 
 
@@ -213,10 +228,11 @@ def _gains(observation: Observation, estimation: EstimationResult) -> Array | No
 
 
 def at_samples(
-    settings: Settings, system: DescriptorSystem, source: Source, levels: NoiseLevels,
-    samples: Sampling, estimator: estimators.Estimator, stage: Stage,
-) -> Estimated:
-    """Observer and estimator at samples of the signals, ``samples.step`` apart (ConfigError)."""
+    result: RunResult, source: Source, levels: NoiseLevels, samples: Sampling,
+    estimator: estimators.Estimator, stage: Stage,
+) -> RunResult:
+    """The same at samples of the signals, ``samples.step`` apart (ConfigError)."""
+    settings, system = result.settings, result.system
     refuse_seeds(settings.noise)
     if source.pieces:
         raise ConfigError("data.file: several files need an observer in continuous time")
@@ -262,8 +278,7 @@ def at_samples(
             # As many numbers in its settings as parameters: all are estimated.
             with suppress(ConfigError):
                 online, made = estimated(columns)
-        truth = online.truth(made.extension)(t, source.theta(t), source.states)
-        x = source.states(t)
+        truth, x = online.truth(made.extension)(t, source.theta(t), source.states), source.states(t)
         parameters = made.parameters * accuracy.told(made.known.parameters[-1])
         states = made.states * accuracy.told(made.seen[-1])
         sizes = accuracy.sizes_of(truth, online.natural_sizes, x)
@@ -294,17 +309,15 @@ def at_samples(
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
-    rows, noisy = made.regression.rows[1 + chosen], bool(source.recording) or not levels.silent
-    return Estimated(
-        online,
-        RegressionResult(
+    rows, noisy = made.regression.rows[1 + chosen], source.noisy(levels)
+    return _completed(
+        result, source, online, [name for name, since in times.items() if since is None],
+        excitation, estimation, metrics, gains,
+        _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy, estimable=times,
+        regression=RegressionResult(
             t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
         ),
-        excitation, estimation,
-        accuracy.standing(estimation, metrics, gains, system) if noisy else metrics,
-        online.fit() if source.recording else None,
-        times, [name for name, since in times.items() if since is None],
-        note=online.note + (_no_deviations(why) if noisy else _held(samples, metrics)),
+        fit=online.fit() if source.recording else None,
     )
 
 
@@ -350,13 +363,9 @@ def _estimate(
     truth = observation.truth(grid, source.theta(grid), source.states)
     size, p, n = len(cases), truth.shape[1], x.shape[1]
     each = size <= _PER_QUANTITY
-    determined = np.ones(p, dtype=bool)
     about_own = observation.names is None and observation.estimator is None
-
-    if about_own:
-        determined = known.parameters[-1]
-    else:
-        seen = np.ones(n, dtype=bool)
+    determined = known.parameters[-1] if about_own else np.ones(p, dtype=bool)
+    seen = seen if about_own else np.ones(n, dtype=bool)
     about = observation, grid, kept, known.independent
     estimates, columns = _estimates(estimator, *about)
     if observation.estimator is None:

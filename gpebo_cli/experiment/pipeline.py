@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 from typing import Self
 
@@ -18,7 +17,6 @@ import numpy as np
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import memory, several, sources
-from gpebo_cli.experiment.assumptions import of_observation, warnings
 from gpebo_cli.experiment.estimation import at_samples, continuous
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
@@ -26,7 +24,7 @@ from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
+from gpebo_cli.experiment.verdict import functions_note, verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
@@ -107,42 +105,20 @@ def run_experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    unbounded = functions_note(system, source.simulation or source.recording)
+    note = functions_note(system, source.simulation or source.recording)
     of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, timings=stage.seconds,
-        assumptions=lambda: tuple(of_source()), verdict=source.verdict + unbounded,
+        assumptions=lambda: tuple(of_source()), verdict=source.verdict + note,
         recording=source.recording,
     )
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)
         return result
-    found = (
-        continuous(settings, system, source, levels, observer, estimator, stage)
-        if samples is None
-        else at_samples(settings, system, source, levels, samples, estimator, stage)
-    )
-    observed, excitation, estimation = found.observed, found.excitation, found.estimation
-    # A result that is kept for what it has to tell must not keep what the observer made.
-    growth = observed.growth, observed.growth_rate
-    of_observer = partial(of_observation, observed.assumptions, growth, excitation, system)
-    warned, told = warnings(observed), partial(
-        verdict, excitation, estimation.cases, estimation.requirement, found.metrics, found.fit,
-        found.unknown, found.left_out, estimation.active,
-    )
-    notes = found.note + simulation_note(source.simulation, settings.solver.tol) + unbounded
-    notes += source.recording.note if source.recording else ""
-    return replace(
-        result, regression=found.regression, excitation=excitation, estimation=estimation,
-        metrics=found.metrics, noise=found.noise, fit=found.fit, estimable=found.estimable,
-        left_out=found.left_out, assumptions=lambda: (*of_source(), *of_observer()),
-        verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
-        warnings=lambda: (*warned, *estimation.warnings),
-        # What the result is labelled with is what estimated.
-        settings=replace(settings, estimator={"name": settings.observer["name"]})
-        if found.by_observer else settings,
-    )
+    if samples is None:
+        return continuous(result, source, levels, observer, estimator, stage)
+    return at_samples(result, source, levels, samples, estimator, stage)
 
 
 def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Array], Online]:

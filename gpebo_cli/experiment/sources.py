@@ -55,6 +55,10 @@ class Source:
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
+    def noisy(self, levels: NoiseLevels) -> bool:
+        """Whether there are errors in what the observer gets to see."""
+        return self.recording is not None or not levels.silent
+
 
 def simulated(
     settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None

@@ -73,12 +73,12 @@ def figures(cases: Sequence[Case], metric: str = "") -> Iterator[tuple[str, Figu
     """
     metric = metric or ranking(case.metrics for case in cases)
     for suffix, members in _comparable(cases).items():
-        yield f"errors{suffix}", compose(error_panels(members))
+        if panels := error_panels(members):
+            yield f"errors{suffix}", compose(panels)
         # Sorted by name: the files are called the same however the cases are sorted.
         numbers = sorted(name for name in varying(members) if _is_axis(members, name))
         for name in numbers:
-            panels = metric_panels(members, name)
-            if panels:
+            if panels := metric_panels(members, name):
                 yield f"over_{name}{suffix}", compose(panels)
         for across, up in combinations(numbers, 2):
             for k, (label, some) in enumerate(_groups(members, (across, up)).items()):

@@ -420,17 +420,12 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
         estimation = result.estimation
         if estimation is None:
             continue
-        parameters = estimation.parameters[case] - estimation.true_parameters
-        parameters = parameters[:, ~np.isnan(estimation.true_parameters).any(axis=0)]
-        seen = _seen(result, _known(result))
-        states = (estimation.states[case] - truth_at(result, estimation.t))[:, seen]
-        of_eta, of_x = (
-            np.linalg.norm(errors, axis=1) if errors.shape[1] else np.zeros(0)
-            for errors in (parameters, states)
-        )
+        truth, x = estimation.true_parameters, truth_at(result, estimation.t)
+        known, seen = ~np.isnan(truth).any(axis=0), _seen(result, _known(result))
         labels.append(label)
-        curves.append(ErrorCurves(
-            estimation.t, of_eta, of_x, _parameter_size(result), _state_size(result)
+        curves.append(ErrorCurves.of(
+            estimation.t, (estimation.parameters[case] - truth)[:, known],
+            (estimation.states[case] - x)[:, seen], truth[:, known], result.signals.states[:, seen],
         ))
     log = all(result.settings.output.error == "log" for _, result, _ in named)
     return norm_panels(curves, labels, log=log)

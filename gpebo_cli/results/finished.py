@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -42,10 +43,23 @@ class ErrorCurves:
     """Norms of the errors of one case, (M,) each, and the size of what they are errors of."""
 
     t: Array
-    parameters: Array  # (M,)
+    parameters: Array  # (M,), empty where nothing is known
     states: Array  # (M,)
     parameter_size: float
     state_size: float
+
+    @classmethod
+    def of(cls, t: Array, of_eta: Array, of_x: Array, eta: Array, x: Array) -> ErrorCurves:
+        """Of errors (M, p) and (M, n) at the times t (M,), with true values (…, p) and (…, n).
+
+        Where there are no columns, nothing is known.
+        """
+        norms = [
+            np.linalg.norm(errors, axis=1) if errors.shape[1] else np.zeros(0)
+            for errors in (of_eta, of_x)
+        ]
+        sizes = [float(np.linalg.norm(true, axis=1).max(initial=0.0)) for true in (eta, x)]
+        return cls(t, norms[0], norms[1], sizes[0], sizes[1])
 
 
 @dataclass(frozen=True)
@@ -152,18 +166,12 @@ def span(folder: Path) -> tuple[float, float]:
 
 def read_errors(cases: Sequence[Case]) -> list[ErrorCurves]:
     """Error norms over time of ``cases``, each folder being read once."""
-    by_folder: dict[Path, set[int]] = {}
-    for case in cases:
-        by_folder.setdefault(case.folder, set()).add(case.number)
-    read = {
-        (folder, number): curves
-        for folder, numbers in by_folder.items()
-        for number, curves in _read_errors(folder, numbers).items()
-    }
-    return [read[case.folder, case.number] for case in cases]
+    read = cache(_read_errors)
+    return [read(case.folder)(case.number) for case in cases]
 
 
-def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
+def _read_errors(folder: Path) -> Callable[[int], ErrorCurves]:
+    """What finds the error norms of a case, by its number."""
     truth = _mapping(read_summary(folder), "parameters")
     # Of a recording, not every true value is known.
     known = {name: float(v) for name, v in truth.items() if isinstance(v, int | float)}
@@ -171,42 +179,32 @@ def _read_errors(folder: Path, numbers: set[int]) -> dict[int, ErrorCurves]:
     everything = read_columns(path, "case", "t", present=[f"{name}_hat" for name in known])
     signals = read_columns(folder / "signals.csv", "t")
     middles = 0.5 * (signals["t"][1:] + signals["t"][:-1])
-    out = {}
-    for number in sorted(numbers):
+
+    def of_case(number: int) -> ErrorCurves:
+        """Its error norms (GpeboError: there is no such case)."""
         rows = everything["case"] == number
         if not rows.any():
             raise GpeboError(f"{path}: there is no case {number}")
         columns = {name: column[rows] for name, column in everything.items()}
-        t = columns["t"]
-        nearest = np.searchsorted(middles, t)  # the estimates are on some of the signals' times
-        names = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
+        nearest = np.searchsorted(middles, columns["t"])  # they are some of the signals' times
+        hats = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
+
+        def table(found: Iterable[Array]) -> Array:
+            return np.array([*found]).reshape(-1, len(nearest)).T
+
         # Parameters stand first; a state may have the name of one.
         states = [
-            s for s in names[len(truth) :]
+            s for s in hats[len(truth) :]
             if s in signals and not np.isnan(columns[f"{s}_hat"]).all()
         ]
-        of_parameters = [
-            columns[f"{name}_hat"] - columns.get(f"{name}_true", value)
-            for name, value in known.items()
-        ]
-        true_states = [signals[name][nearest] for name in states]
-        of_states = [
-            columns[f"{s}_hat"] - true for s, true in zip(states, true_states, strict=True)
-        ]
-        out[number] = ErrorCurves(
-            t,
-            _norm(of_parameters, len(t)),
-            _norm(of_states, len(t)),
-            float(np.linalg.norm(list(known.values()))),
-            float(_norm(true_states, len(t)).max(initial=0.0)),
+        x = table(signals[name][nearest] for name in states)
+        of_eta = (columns[f"{k}_hat"] - columns.get(f"{k}_true", v) for k, v in known.items())
+        return ErrorCurves.of(
+            columns["t"], table(of_eta), table(columns[f"{s}_hat"] for s in states) - x,
+            np.array([list(known.values())]), x,
         )
-    return out
 
-
-def _norm(columns: Sequence[Array], count: int) -> Array:
-    if not columns:
-        return np.zeros(count)
-    return np.asarray(np.linalg.norm(np.stack(columns), axis=0))
+    return of_case
 
 
 def read_summary(folder: Path) -> dict[str, Any]:

@@ -218,7 +218,8 @@ def compose(panels: Sequence[Panel], look: OutputSettings | None = None) -> Figu
             _fill(axes, panel, tall)
             _set_across(axes, shown)
         for axes in rows[:-1]:
-            _only_mark_ticks(axes)
+            axes.tick_params(labelbottom=False)
+            axes.set_xlabel("")
         _arrange(figure, rows, shown, tall)
         if len(panels) > len(shown):
             note = f"{len(shown)} of {len(panels)} shown"
@@ -417,18 +418,6 @@ def _set_ticks(axis: Any, most: int, unit: str, *, log: bool) -> str:
     labels = [f"{tick / size + 0.0:.{decimals}f}".replace("-", "−") for tick in ticks]
     axis.set_ticks(ticks, labels)
     return " ".join(filter(None, (power_of_ten(exponent) if exponent else "", escaped(unit))))
-
-
-def _only_mark_ticks(axes: Axes) -> None:
-    """Leave of the horizontal axis its ticks: one artist in place of five for each of them."""
-    ticks = axes.get_xticks()
-    axes.set_xticks([])
-    axes.set_xlabel("")
-    axes.plot(
-        ticks, np.zeros(len(ticks)), linestyle="none", marker=3, clip_on=False,  # 3: tick down
-        markersize=sheet()["xtick.major.size"], markeredgewidth=sheet()["xtick.major.width"],
-        color=axes.spines["bottom"].get_edgecolor(), transform=axes.get_xaxis_transform(),
-    )
 
 
 def _set_name(axes: Axes, name: str, unit: str, height: float) -> None:
