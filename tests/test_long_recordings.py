@@ -303,7 +303,7 @@ def test_estimators_and_evidence_go_on_from_window_to_window(settings, monkeypat
             *made.requirement.evidence.values(),
         ]
         if isinstance(estimator, estimators.Affine):
-            for at in estimators.errors(estimator, own):
+            for at, _ in estimators.errors(estimator, own):
                 numbers += [np.broadcast_to(x, (len(t), *x.shape[1:])) for x in at(t, t)]
         found.append([np.array(x, dtype=float) for x in numbers if x is not None])
     for whole, cut in zip(*found, strict=True):

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain, islice
+from itertools import chain, islice, zip_longest
 
 import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator
 from gpebo_cli.estimators._registry import Several, SeveralEstimates, able
+from gpebo_cli.evidence.uncertainty import after_reset
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.regression.errors import ErrorsAt, one_after_another
@@ -149,23 +150,38 @@ def in_windows(
     return Gone(np.concatenate(etas, axis=1), shown, mixed, requirement)
 
 
-def errors(estimator: Affine, regression: LinearRegression) -> Sequence[ErrorsAt]:
-    """``estimator.errors`` without resets; of a long regression what one window needs is held."""
-    if not (regression.long and isinstance(estimator, Windowed)):
-        return estimator.errors(regression)
-    known: list[Known] = [()]
-    for window in regression.windows():
-        end = window.mesh.edges[-1:]
-        known.append(estimator.go_on(window, end, known[-1]).reached)
-    starts = np.array([window.mesh.edges[0] for window in regression.windows()])
+def errors(
+    estimator: Affine, regression: LinearRegression
+) -> Sequence[tuple[ErrorsAt, Sequence[tuple[float, Array]]]]:
+    """``estimator.errors`` from segment to segment, and what resets do to them, of every case.
 
-    @lru_cache(maxsize=1)
-    def of_window(k: int) -> Sequence[ErrorsAt]:
-        window = next(islice(regression.windows(), k, None))
-        return estimator.errors(window, known[k])  # type: ignore[call-arg]
+    Of a long regression what one window needs is held.
+    """
+    if not (isinstance(estimator, Windowed) and (regression.resets or regression.long)):
+        return [(own, ()) for own in estimator.errors(regression)]
 
-    def of_case(g: int) -> ErrorsAt:
-        return one_after_another(starts, lambda k, t, inside: of_window(k)[g](t, inside))
+    def parts() -> Iterable[LinearRegression]:
+        return regression.segments if regression.resets else regression.windows()
+
+    known, ends = list[Known]([()]), list[Known]()
+    for part, reset in zip_longest(parts(), regression.resets):
+        ends.append(estimator.go_on(part, part.mesh.edges[-1:], known[-1]).reached)
+        known.append(ends[-1] if reset is None else [state.after(reset) for state in ends[-1]])
+    starts = np.array([part.mesh.edges[0] for part in parts()])
+
+    @lru_cache(maxsize=None if regression.resets else 1)
+    def of_part(k: int) -> Sequence[ErrorsAt]:
+        part = next(islice(parts(), k, None))
+        return estimator.errors(part, known[k])  # type: ignore[call-arg]
+
+    def of_case(g: int) -> tuple[ErrorsAt, Sequence[tuple[float, Array]]]:
+        turns = []
+        for k, reset in enumerate(regression.resets):
+            mesh, own = regression.segments[k].mesh, ends[k]
+            system = of_part(k)[g](mesh.edges[-1:], mesh.inside[-1, -1:])
+            state = own[g * len(own) // len(estimator.cases)] if own else None
+            turns.append((reset.time, after_reset(system, reset, state)))
+        return one_after_another(starts, lambda k, t, inside: of_part(k)[g](t, inside)), turns
 
     return [of_case(g) for g in range(len(estimator.cases))]
 

@@ -12,7 +12,7 @@ orthogonal transformations: no variance can become negative, whatever the roundi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -48,6 +48,7 @@ _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a directio
 def deviations(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, rows: Rows,
     variances: Array, t: Array, starts: Array | None = None,
+    resets: Sequence[tuple[float, Array]] = (),
 ) -> tuple[Array, Array]:
     """One standard deviation of η̂ (M, p) and of x̂ (M, n) at the times t (M,), ascending.
 
@@ -55,18 +56,20 @@ def deviations(
     of Y to those of η̂; the gain is that of x = offset + gain η (M, n, p). ψ is smooth between
     ``edges`` (K + 1,), in seconds, and ``variances`` are those of [u; y] in each of the rows (m +
     r,). ζ begins anew at the edges ``starts``, of several experiments; None: at the first one only.
+    At the times of ``resets`` a matrix (S, k + S) makes s of [ζ; s], and ζ is zero.
     """
-    most, per, before = len(rows.t) // _GROUPS, _PER_ELAPSED, list[Array]()
+    most = 1 if resets else len(rows.t) // _GROUPS
+    per, before = _PER_ELAPSED, list[Array]()
     anew = edges[:1] if starts is None else starts
     while True:
         groups = grouped(rows, edges[-1], t, anew, most, per)
-        *found, _ = propagated(
-            observer, estimator, gain, edges, groups, variances, t, None, starts
+        found = _propagated(
+            observer, estimator, gain, edges, groups, variances, t, anew, resets
         )
         if groups.alone or (before and all(map(_agree, before, found))):
             return found[0], found[1]
         finer = 4 if before else 2
-        before, most, per = found, most // finer, per * finer
+        before, most, per = [*found], most // finer, per * finer
 
 
 def _agree(coarse: Array, fine: Array) -> bool:
@@ -74,14 +77,11 @@ def _agree(coarse: Array, fine: Array) -> bool:
     return bool((np.abs(coarse - fine) <= _AGREE * (fine + _AGREE * largest)).all())
 
 
-def propagated(
+def _propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
-    variances: Array, t: Array, L: Array | None, starts: Array | None = None,
-) -> tuple[Array, Array, Array]:
-    """:func:`deviations` of grouped rows; the third is L (size, ·) of cov [ζ; s; e] at the end.
-
-    It starts from ``L`` at the first edge; None: everything is known there. ``gain`` is (M, n, p).
-    """
+    variances: Array, t: Array, starts: Array, resets: Sequence[tuple[float, Array]],
+) -> tuple[Array, Array]:
+    """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
     n, p = gain.shape[1:]
     mesh, fresh, group = _mesh(edges, groups)
     until = np.append(groups.starts[1:], np.inf)
@@ -91,10 +91,11 @@ def propagated(
     size, signals = zeta + own, len(variances)
     stretch = max(1, _CHUNK // (size * mesh.rule.stages) ** 2)
     anew = np.zeros(mesh.size, dtype=bool)
-    if starts is not None:
-        anew[np.searchsorted(mesh.edges, starts)] = True
-    anew[0] = L is None  # else an error of the last row goes on
-    fresh[0] &= anew[0] or among(mesh.edges[:1], groups.starts, 1e-3 * mesh.steps[0])[0]
+    anew[np.searchsorted(mesh.edges, starts)] = True
+    turns = {int(k): np.pad(np.eye(own), ((zeta, 0), (zeta, 0))) for k in np.flatnonzero(anew)}
+    for time, turn in resets:
+        turns[int(np.searchsorted(mesh.edges, time))] = np.pad(turn, ((zeta, 0), (0, 0)))
+    L: Array | None = None
     # The errors that count in an element.
     beside = groups.first[group, None] + np.arange(1 + groups.memory.shape[1])
     beside = beside.clip(max=len(groups.shares) - 1)
@@ -110,7 +111,7 @@ def propagated(
         wanted, place = np.unique(element - first, return_inverse=True)
         factors, L = _factors(
             maps[:, -1], fresh[part], anew[part], shares[part, :, None] * np.sqrt(variances),
-            memory[part], L, zeta, wanted,
+            memory[part], L, {k - first: turn for k, turn in turns.items()}, wanted,
         )
         if not len(wanted):
             continue
@@ -132,33 +133,25 @@ def propagated(
         x = gain[chosen] @ eta
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
         of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
-    return of_eta, of_x, np.zeros((0, 0)) if L is None else L
+    return of_eta, of_x
 
 
-def after_reset(
-    L: Array, estimator: ErrorsAt, end: tuple[Array, Array], reset: Reset,
-    known: ExtensionState | None,
-) -> Array:
-    """L of [ζ; s; e] (size, ·) after a reset, where w starts from its estimate.
+def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None) -> Array:
+    """s (S, k + S) after a reset where w starts from its estimate, of [ζ; s] before it.
 
     η₊ = T η + τ + V ζ and ζ₊ = 0. The error of 𝒴 becomes S δ𝒴 − Ω₊ V ζ, and that of an estimate
-    from which the estimator starts T δη̂ − V ζ. The segment that ends does so at ``end``, as time
-    and where functions that jump are decided, (1,) each, with ``known`` [Ω | 𝒴]; None: there is no
-    extension.
+    from which the estimator starts T δη̂ − V ζ. The system of its errors is that at the end of the
+    segment, with ``known`` [Ω | 𝒴]; None: there is no extension.
     """
-    system = estimator(*end)
-    V = np.zeros((0, 0)) if reset.errors is None else reset.errors
-    (p, zeta), own = V.shape, system.A.shape[1]
+    V, own = np.zeros((0, 0)) if reset.errors is None else reset.errors, system.A.shape[1]
+    p, zeta = V.shape
     J = np.zeros((own, zeta + own))
     if known is not None:
         J[:p, zeta : zeta + p] = known.carries(reset)
         J[:p, :zeta] = -known.after(reset).values[:, :p] @ V
     if known is None or own > p:  # the last p of s are δη̂ itself
         J[-p:, zeta:], J[-p:, :zeta] = reset.transform @ system.C[0], -V
-    out = L.copy()
-    out[:zeta] = 0.0
-    out[zeta : zeta + own] = J @ L[: zeta + own]
-    return out
+    return J
 
 
 def of_least_squares(
@@ -343,14 +336,15 @@ def _joint(
 
 def _factors(
     ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, memory: Array,
-    L: Array | None, zeta: int, wanted: IntArray,
+    L: Array | None, turns: Mapping[int, Array], wanted: IntArray,
 ) -> tuple[Array, Array]:
     """L of [ζ; s; e] at the left ends of elements ``wanted`` (W, d + a (m + r), ·), and at the end.
 
     The errors of several rows stand in L side by side, before it is made triangular again. An
     element makes ``ends`` of it (K, d, d + a (m + r)). Of the a errors that count, with
     ``deviations`` (K, a, m + r) and a ``memory`` (K, a, a − 1) of those before them, the first
-    gives way to another one where ``fresh``, and all of them do where ``anew``; ζ is zero there.
+    gives way to another one where ``fresh``, and all of them do where ``anew``. Matrices ``turns``
+    (d, d) make [ζ; s] of itself at the left ends of some elements.
     """
     size, (alive, signals) = ends.shape[1], deviations.shape[1:]
     own, whole = np.arange(signals), size + alive * signals
@@ -361,8 +355,8 @@ def _factors(
     out, told = np.empty((len(wanted), *L.shape)), 0
     asked = np.isin(np.arange(len(ends)), wanted).tolist()
     for k, end in enumerate(ends):
-        if anew[k]:
-            L[:zeta] = 0.0
+        if k in turns:
+            L[:size] = turns[k] @ L[:size]
         for block in range(0 if anew[k] else alive - fresh[k], alive):
             if used == width:
                 L[:, :whole] = np.asarray(np.linalg.qr(L.T, mode="r")).T

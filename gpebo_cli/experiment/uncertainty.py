@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from gpebo_cli.estimators import ResumableEstimator
 from gpebo_cli.estimators import errors as behind
-from gpebo_cli.evidence.groups import each_alone
-from gpebo_cli.evidence.uncertainty import (
-    SampledDeviations,
-    after_reset,
-    deviations,
-    noise_level,
-    propagated,
-)
+from gpebo_cli.evidence.uncertainty import SampledDeviations, deviations, noise_level
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, IntArray
@@ -24,7 +15,6 @@ from gpebo_cli.observers._base import Differentiable, Observation
 from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import NoiseSettings
 
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
@@ -134,13 +124,12 @@ def standard_deviations(
             return _FEW
         variances *= level**2
     gains = state_map.gains(t, states)[..., columns]
-    if regression.resets and isinstance(estimator, ResumableEstimator):
-        found = list(_over_resets(errors, estimator, regression, gains, rows, variances, t))
-    else:
-        found = [
-            deviations(errors, of_case, gain, edges, rows, variances, t, observation.starts)
-            for of_case, gain in zip(behind(estimator, regression), gains, strict=True)
-        ]
+    found = [
+        deviations(
+            errors, of_case, gain, edges, rows, variances, t, observation.starts, resets
+        )
+        for (of_case, resets), gain in zip(behind(estimator, regression), gains, strict=True)
+    ]
     return np.array([eta for eta, _ in found]), np.array([x for _, x in found])
 
 
@@ -155,35 +144,3 @@ def _level(
     told = np.isfinite(squares)
     weights = lengths * told
     return float(np.sqrt(np.nansum(weights * squares) / weights.sum())) if told.any() else np.nan
-
-
-def _over_resets(
-    errors: ErrorsAt, estimator: ResumableEstimator, regression: LinearRegression, gains: Array,
-    rows: Rows, variances: Array, t: Array,
-) -> Iterator[tuple[Array, Array]]:
-    """Deviations of every case, from segment to segment."""
-    segments, resets = regression.segments, regression.resets
-    groups = each_alone(rows, regression.mesh.edges[:1])
-    cuts = np.searchsorted(t, [reset.time for reset in resets], side="left")
-    parts = np.split(np.arange(len(t)), cuts)
-    known: tuple[ExtensionState, ...] = ()
-    factors: list[Array | None] = [None] * len(gains)
-    found: list[list[tuple[Array, Array]]] = [[] for _ in gains]
-    for segment, own, reset in zip(segments, parts, (*resets, None), strict=True):
-        mesh = segment.mesh
-        end = mesh.edges[-1:], mesh.inside[-1, -1:]
-        systems = estimator.errors(segment, known)  # type: ignore[attr-defined]
-        reached = estimator.resume(segment, mesh.edges[-1:], known).reached
-        for g, system in enumerate(systems):
-            *of, L = propagated(
-                errors, system, gains[g][own], mesh.edges, groups, variances, t[own], factors[g],
-            )
-            found[g].append((of[0], of[1]))
-            if reset is not None:
-                state = reached[g * len(reached) // len(systems)] if reached else None
-                factors[g] = after_reset(L, system, end, reset, state)
-        if reset is not None:
-            known = tuple(state.after(reset) for state in reached)
-    for own_parts in found:
-        eta, x = zip(*own_parts, strict=True)
-        yield np.concatenate(eta), np.concatenate(x)
