@@ -220,7 +220,7 @@ def show(hydra: Hydra, arguments: Arguments) -> bool:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """The configuration without Hydra's section as plain data.
+    """The configuration as plain data, without Hydra's section and what a page of figures says.
 
     There are no interpolations in it: a stranger's sweep can give values that Hydra's grammar turns
     into one, and it could read environment variables or other parts of the configuration
@@ -235,4 +235,4 @@ def plain(config: DictConfig) -> dict[str, Any]:
             raise ConfigError(f"{where}: ${{…}} is not allowed; write the value")
         if value == "???":
             raise ConfigError(f"{where} has no value yet (???); give it one")
-    return content
+    return {key: value for key, value in content.items() if key not in ("drawn", "note")}

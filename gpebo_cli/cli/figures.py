@@ -12,7 +12,7 @@ from gpebo_cli.cli.arguments import NO_WORDS, Arguments
 from gpebo_cli.cli.options import CONFIG_DIR, VOLUME, no_option, parse
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.schema import shown, unknown
+from gpebo_cli.schema import convert, shown, unknown
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
@@ -39,11 +39,11 @@ def main(words: list[str]) -> int:
     from gpebo_cli.results import circuit, gallery
     from gpebo_cli.results.files import make_folder, write_text
     from gpebo_cli.results.provenance import provenance
-    from gpebo_cli.results.studies import STUDIES, Study
+    from gpebo_cli.results.studies import PAPERS, STUDIES
 
     folder = Path(options.values.get("--output", _OUTPUT))
     names = names or list(STUDIES)
-    if not circuit.available() and any(STUDIES.get(n, Study()).is_the_papers for n in names):
+    if PAPERS in names and not circuit.available():
         sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
     make_folder(folder)
     sections: list[Section] = []
@@ -108,8 +108,6 @@ def _formats(text: str) -> list[str]:
 
 def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[Recipe]:
     """Compose and run recipes, one at a time, those of a folder of one's own included."""
-    from omegaconf import OmegaConf
-
     from gpebo_cli.cli.composition import session
     from gpebo_cli.results.gallery import Recipe
 
@@ -120,8 +118,9 @@ def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[R
         for label, cfg in jobs:
             where = f"experiment {name}" + (f", {label}" if label else "")
             runs[label] = run_recipe_job(cfg, arguments, where)
-        words = {key: str(OmegaConf.select(cfg, key) or "") for key in ("title", "reference")}
-        yield Recipe(name, runs=runs, **words)
+        words = {key: str(cfg.get(key) or "") for key in ("title", "reference", "note")}
+        drawn = convert(cfg.get("drawn"), list[str] | None, f"experiment {name}: drawn")
+        yield Recipe(name, runs=runs, drawn=drawn, **words)
 
 
 def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:

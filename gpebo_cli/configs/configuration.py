@@ -24,6 +24,7 @@ from gpebo_cli.settings import (
 KEYS = (
     "plant", "data", "observer", "estimator", "solver", "noise", "time", "excitation", "figures",
     "output", "uncertainty", "title", "reference", "expected", "theirs", "differs", "erratum",
+    "drawn", "note",
 )
 """Keys of a configuration, from which everything about a run follows."""
 

@@ -16,7 +16,7 @@ from gpebo_cli.results.names import FORMATS
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.report import case_cells, case_rows
 from gpebo_cli.results.series import blocks, blocks_text, differences, reference_text
-from gpebo_cli.results.studies import CAPTIONS, REFERENCE, STUDIES, Study, heading, stem
+from gpebo_cli.results.studies import CAPTIONS, PAPERS, REFERENCE, heading, stem
 from gpebo_cli.results.style import Panel, compose, save
 
 if TYPE_CHECKING:
@@ -30,7 +30,9 @@ class Recipe:
     name: str
     title: str
     reference: str
+    note: str  # whose the settings are
     runs: Mapping[str, RunResult]
+    drawn: list[str] | None = None  # figures; None: all that its run has
 
 
 class Section(NamedTuple):
@@ -44,9 +46,8 @@ class Section(NamedTuple):
 
 def figures_of(recipe: Recipe) -> dict[str, list[Panel]]:
     """Panels of all figures of a recipe, in the order in which they are shown."""
-    study = STUDIES.get(recipe.name, Study())
     if "" in recipe.runs:
-        return describe(recipe.runs[""], study.figures)
+        return describe(recipe.runs[""], recipe.drawn)
     return {"estimators": panels} if (panels := overlay(recipe.runs)) else {}
 
 
@@ -56,18 +57,17 @@ def write_recipe(
     """Draw ``figures`` into ``folder``, a CSV file beside each; earlier ones are removed."""
     make_folder(folder)
     remove_files(p for s in (*FORMATS, "csv") for p in sorted(folder.glob(f"fig*.{s}")))
-    study = STUDIES.get(recipe.name, Study())
     pictures = []
-    if study.is_the_papers and circuit.available():
+    if recipe.name == PAPERS and circuit.available():
         write_text(folder / f"{stem('circuit')}.csv", circuit.netlist())
         alt = "Circuit diagram: " + "; ".join(map(_branch_text, circuit.BRANCHES)) + "."
-        pictures.append(_save(folder, "circuit", circuit.circuit(), study, alt, formats))
+        pictures.append(_save(folder, "circuit", circuit.circuit(), alt, formats))
     for name, panels in figures.items():
         write_text(folder / f"{stem(name)}.csv", blocks_text(blocks(panels)))
-        pictures.append(_save(folder, name, compose(panels), study, _alt(name, panels), formats))
+        pictures.append(_save(folder, name, compose(panels), _alt(name, panels), formats))
     runs = recipe.runs
     verdicts = [f"{_sentence(run.verdict)}." for run in runs.values()] if len(runs) == 1 else []
-    words = "".join(map(html.paragraph, (recipe.reference, study.note, *verdicts)))
+    words = "".join(map(html.paragraph, (recipe.reference, recipe.note, *verdicts)))
     cases = case_cells([(name, row) for name, run in runs.items() for row in case_rows(run)])
     drawn = f'<div class="figures">\n{"".join(pictures)}</div>\n'
     name, title = escape(recipe.name), escape(_sentence(recipe.title))
@@ -121,7 +121,7 @@ def page(sections: Sequence[Section], made_by: Provenance) -> str:
 
 
 def _save(
-    folder: Path, name: str, figure: Figure, study: Study, alt: str, formats: Sequence[str]
+    folder: Path, name: str, figure: Figure, alt: str, formats: Sequence[str]
 ) -> str:
     """Write a picture; how the page shows it, with links to its files."""
     for suffix in formats:
@@ -132,7 +132,7 @@ def _save(
     text = escape(CAPTIONS[name].text.rstrip("."))
     return f"""<figure>
 <img src="{base}.png" width="{width}" height="{height}" alt="{escape(alt)}">
-<figcaption><b>{heading(name, study)}:</b> {text}. {links}</figcaption>
+<figcaption><b>{heading(name, folder.name)}:</b> {text}. {links}</figcaption>
 </figure>
 """
 

@@ -1,4 +1,4 @@
-"""What ``gpebo figures`` shows of each recipe, and the words that go with it.
+"""What ``gpebo figures`` shows, and the words that go with each figure.
 
 Figure numbers are those of the paper, arXiv:2407.14373.
 """
@@ -7,20 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-
-_OF_THE_PAPER = (
-    "regressor", "states", "estimates_a", "estimates_b", "parameter_error", "state_error_a",
-    "state_error_b", "gram", "delta",
-)
-
-
-@dataclass(frozen=True)
-class Study:
-    """A recipe's figures (None: all its run has), and whose settings it uses."""
-
-    figures: tuple[str, ...] | None = None
-    note: str = ""
-    is_the_papers: bool = False  # its figures carry the paper's numbers
 
 
 @dataclass(frozen=True)
@@ -31,51 +17,13 @@ class Caption:
     number: int | None = None
 
 
-STUDIES: Mapping[str, Study] = {
-    "paper_circuit": Study(
-        _OF_THE_PAPER,
-        "The paper’s: the circuit, its input and initial values, the start of the dynamic "
-        "extension, the filters 0.1, 0.2, 0.3 and the gain γ = 10¹⁰. Ours: the horizon of 20 s, "
-        "of which the paper states none, and the second gain, γ = 10⁸, of which it says only that "
-        "there is one. The regressor is the projected one: taken literally, the paper’s is zero "
-        "(last study). The initial current iv is −3.45 A, not −0.25 A as printed: index 2 leaves "
-        "no choice.",
-        is_the_papers=True,
-    ),
-    "paper_descriptor": Study(
-        _OF_THE_PAPER,
-        "The paper’s: the form of the system and of the observer (Section II). Ours: all numbers, "
-        "the horizon of 20 s, and the estimator, ls_drem with γ = 1 and 10. With the circuit’s "
-        "filters Δ is so small here that γ would have to be 10¹⁴.",
-    ),
-    "paper_canonical": Study(
-        _OF_THE_PAPER,
-        "The paper’s: the form of the system and the observers of Propositions 3 and 4, the "
-        "latter with its signs corrected. Ours: all numbers, the horizon of 20 s, and the "
-        "estimator, ls_drem with γ = 1 and 10. The observer does not see zb3, so its estimate is "
-        "not drawn. Those of zb1 and zb2 come from the observer of Proposition 4, whose error "
-        "decays at its own rate, whatever γ.",
-    ),
-    "gain_sweep": Study(
-        ("gains", "error_norms"),
-        "The circuit with 25 gains from 10⁶ to 10¹² in one run. The paper’s: γ = 10¹⁰. Ours: all "
-        "other gains and the horizon of 20 s, which is enough for all of them: the final errors "
-        "are rounding.",
-    ),
-    "estimators_compared": Study(
-        (),
-        "The circuit once for every estimator, each with its own default gains, which are not "
-        "comparable with each other. The paper’s: drem with γ = 10¹⁰. Ours: all others and the "
-        "horizon of 20 s. The gradient needs persistent excitation, which the circuit does not "
-        "have.",
-    ),
-    "literal_regressor": Study(
-        ("regressor", "parameter_error"),
-        "The circuit with the regressor as eq. (regpsi) defines it: the last r rows of the "
-        "residual. They carry all of it only if A22 is nonsingular, and the circuit’s is not: ψ "
-        "is zero, nothing is excited, and no estimate moves. Ours: the horizon of 20 s.",
-    ),
-}
+STUDIES = (
+    "paper_circuit", "paper_descriptor", "paper_canonical", "gain_sweep", "estimators_compared",
+    "literal_regressor",
+)
+"""The recipes, in the order in which they are shown."""
+PAPERS = "paper_circuit"
+"""The one whose figures carry the paper's numbers."""
 
 CAPTIONS: Mapping[str, Caption] = {
     "circuit": Caption(
@@ -107,7 +55,10 @@ CAPTIONS: Mapping[str, Caption] = {
 
 # What a committed reference is compared with: the paper's figures and those over gains and
 # estimators. Of Δ and the Gram matrix the early part, 1e-20, is rounding.
-REFERENCE = (*_OF_THE_PAPER[:7], "gains", "error_norms", "estimators")
+REFERENCE = (
+    "regressor", "states", "estimates_a", "estimates_b", "parameter_error", "state_error_a",
+    "state_error_b", "gains", "error_norms", "estimators",
+)
 
 
 def stem(figure: str) -> str:
@@ -116,9 +67,9 @@ def stem(figure: str) -> str:
     return f"fig_{figure}" if number is None else f"fig{number}_{figure}"
 
 
-def heading(figure: str, study: Study) -> str:
+def heading(figure: str, recipe: str) -> str:
     """What a caption begins with."""
     number = CAPTIONS[figure].number
     if number is None:
         return "Not in the paper"
-    return f"Fig. {number} of the paper" if study.is_the_papers else f"As Fig. {number}"
+    return f"Fig. {number} of the paper" if recipe == PAPERS else f"As Fig. {number}"
