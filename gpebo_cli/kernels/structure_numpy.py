@@ -54,16 +54,6 @@ def array_size(M: Array, a: Array) -> Array:
     return np.asarray(np.maximum(size, _TINY))  # a plant of zeros has none
 
 
-def relative_singular_values(
-    E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int
-) -> Array:
-    """Of M at N times, relative to its size, (N, (μ+1) n)."""
-    e, a = scaled(E, A, rows, columns, time, orders)
-    M, _ = derivative_array(e, a, orders - 1)
-    sigma = np.asarray(np.linalg.svd(M, compute_uv=False), dtype=np.float64)
-    return np.asarray(sigma / array_size(sigma[:, 0], a)[:, None])
-
-
 def levels(
     E: Array, A: Array, rows: Array, columns: Array, time: float, orders: int, rank_tol: float,
     constraints: int,

@@ -49,7 +49,12 @@ def largest_over_time(values: Array, axes: int = 1) -> Array:
 
 
 def taylor_product(a: Array, b: Array) -> Array:
-    """Of matrices of Taylor coefficients (K + 1, N or 1, i, j), to the orders that both have."""
+    """Of Taylor coefficients of matrices (K + 1, N or 1, i, j) with those of others, or of vectors.
+
+    To the orders that both have.
+    """
+    if b.ndim < a.ndim:
+        return taylor_product(a, b[..., None])[..., 0]
     return np.array([
         sum(a[j] @ b[k - j] for j in range(k + 1)) for k in range(min(len(a), len(b)))
     ])

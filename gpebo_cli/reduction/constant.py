@@ -14,6 +14,7 @@ from math import factorial
 
 import numpy as np
 
+from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.reduction.explicit import MoreOrdersError, UndecidedError
 from gpebo_cli.reduction.scaling import scales_of
@@ -121,10 +122,7 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     Z1 = np.linalg.svd(e @ free, full_matrices=False)[0]
     whole = np.concatenate([Z1.T @ e, A2])
     size = np.linalg.norm(whole, axis=1)
-    try:
-        inverse = np.linalg.inv(whole / size[:, None]) / size
-    except np.linalg.LinAlgError:
-        raise UndecidedError from None
+    inverse = inverses((whole / size[:, None])[None])[0] / size
     if not np.linalg.norm(inverse * size) < 1.0 / _CLEAR:
         raise UndecidedError
     d = n - count

@@ -17,7 +17,7 @@ from gpebo_cli.kernels.structure_numpy import (
     scaled,
 )
 from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem, distinct
-from gpebo_cli.numerics.linalg import inverse_or_none, transpose
+from gpebo_cli.numerics.linalg import inverse_or_none, taylor_product, transpose
 from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks, who
 
@@ -27,12 +27,7 @@ _LOOKS = 32  # times at which the sensitivity to rounding is looked at
 
 def forcing(c: Coefficients) -> Array:
     """Taylor coefficients of f = B u + F θ + φ, shape (K + 1, N, n)."""
-    f = c.phi.copy()
-    for k in range(len(f)):
-        for i in range(k + 1):
-            f[k] += np.matmul(c.F[i], c.theta[k - i][..., None])[..., 0]
-            f[k] += np.matmul(c.B[i], c.u[k - i][..., None])[..., 0]
-    return f
+    return np.asarray(c.phi + taylor_product(c.F, c.theta) + taylor_product(c.B, c.u))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,8 +196,8 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
     """D u + H θ at N times, (N, r): what no state has part in; None: there is nothing."""
     if {"D", "H"} <= zero:
         return None
-    terms = (c.D[0], c.u[0]), (c.H[0], c.theta[0])
-    return np.asarray(sum(np.matmul(matrix, v[:, :, None])[:, :, 0] for matrix, v in terms))
+    found: Array = taylor_product(c.D[:1], c.u[:1])[0] + taylor_product(c.H[:1], c.theta[:1])[0]
+    return found
 
 
 def _by_singular_vectors(

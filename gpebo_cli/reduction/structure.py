@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.structure_numpy import frobenius_norm, relative_singular_values, scaled
+from gpebo_cli.kernels.structure_numpy import frobenius_norm, scaled
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray, distinct
 from gpebo_cli.model.expressions import halved
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
@@ -341,13 +341,13 @@ def _judged(
     E, A = (x if x.shape[1] == 1 else x[:, which] for x in (c.E, c.A))
     counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
     if (counts != a).any():
-        sigma = relative_singular_values(E, A, *model[2:])
-        ranks, times = sigma.shape[1] - counts.astype(int), t[which]
-        k = int(np.argmax(ranks != ranks[0]))
-        value = sigma[min(k, len(sigma) - 1), min(int(ranks[k]), int(ranks[0]))]
+        times, k = t[which], int(np.argmax(counts != counts[0]))
+        first, then = ((mu + 1) * n - int(counts[i]) for i in (0, k))
+        lost = min((mu + 1) * n - min(first, then) - 1, n)  # constraints, were it not zero
+        value = kernels.structure.levels(E, A, *model[2:], rank_tol, lost)[1][:, 0]
         return _Levels(a, bounds, (
-            f"the rank of the derivative array changes from {ranks[0]} at t = {times[0]:.6g} to "
-            f"{ranks[k]} at t = {times[k]:.6g} (singular value {value:.1e})"
+            f"the rank of the derivative array changes from {first} at t = {times[0]:.6g} to "
+            f"{then} at t = {times[k]:.6g} (singular value {value[min(k, len(value) - 1)]:.1e})"
         ))
     bounds[which] = exact
     if failure := _why_not(t[which], exact, rank_tol):

@@ -23,6 +23,7 @@ from gpebo_cli.model.expressions import Tape, aside, switched, with_others
 from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.reduction.strangeness_free import forcing
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
 # and by rounding over it, which costs Newton's method nothing that could be seen.
@@ -115,8 +116,8 @@ class Linearised:
         def right_side() -> tuple[Array, Array]:
             """A x̄ + B u + F θ̄ + φ (order + 1, N, n), and which side of a jump y is on (N, ·)."""
             m = source.taylor(t, order, inside, along)
-            of_known = _product(m.B, known.u) + _product(m.F, known.theta)
-            return m.phi + _product(m.A, x) + of_known, self._sides(there, along)
+            f = forcing(m._replace(u=known.u, theta=known.theta))
+            return f + taylor_product(m.A, x), self._sides(there, along)
 
         here, side = right_side() if self._switching else (np.zeros(()), np.zeros((len(t), 0)))
         G = np.empty((*x.shape, self.system.r))
@@ -132,8 +133,8 @@ class Linearised:
             apart = ends[0] - ends[1]
             apart[np.abs(apart) <= _NO_MORE * np.abs(ends[0])] = 0.0
             G[..., j] = apart / np.maximum(width, 1e-300)[:, None]
-        GC, GH = _product(G, c.C), _product(G, c.H)
-        phi = c.phi - _product(GC, x) - _product(GH, known.theta)
+        GC, GH = taylor_product(G, c.C), taylor_product(G, c.H)
+        phi = c.phi - taylor_product(GC, x) - taylor_product(GH, known.theta)
         return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
 
     def _sides(self, t: Array, along: Array) -> Array:
@@ -156,7 +157,8 @@ class Linearised:
             known.theta[0] = self.theta
         there = self._there(t, inside)
         x = self.guess.taylor(there, order, inside)
-        y = _product(known.C, x) + _product(known.D, known.u) + _product(known.H, known.theta)
+        y = taylor_product(known.C, x) + taylor_product(known.D, known.u)
+        y += taylor_product(known.H, known.theta)
         u = known.u
         if there is not t and self.system.m:
             u = source.of_time.taylor(there, order, inside, signals).u
@@ -176,8 +178,3 @@ def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bo
     if not isinstance(source, FollowsSignals):
         return mesh.edges, True
     return source.along(known.cells, range(system.m, system.m + system.r), mesh.edges)
-
-
-def _product(a: Array, b: Array) -> Array:
-    """Taylor coefficients of a product of matrices (K + 1, N, i, j) and (K + 1, N, j[, k])."""
-    return taylor_product(a, b) if b.ndim == a.ndim else taylor_product(a, b[..., None])[..., 0]

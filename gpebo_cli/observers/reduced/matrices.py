@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.arrays import joined
+from gpebo_cli.kernels.arrays import inverses, joined
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -315,11 +315,8 @@ def _eliminate(
     if n_b == 0:
         return on_kernel, kernel[:1], np.full(len(size), np.inf)
     Q1, R1 = np.linalg.qr(on_kernel)
-    try:
-        inverse = np.asarray(np.linalg.inv(R1), dtype=np.float64)
-        bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
-    except np.linalg.LinAlgError:
-        inverse, bound = R1, np.zeros(len(R1))
+    inverse = inverses(R1)
+    bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
     doubtful = np.flatnonzero(~(bound > rank_tol))
     if len(doubtful):
         sigma = np.linalg.svd(on_kernel[doubtful], compute_uv=False)

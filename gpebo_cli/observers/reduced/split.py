@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -131,10 +132,7 @@ def split_in_frame(E: Array, frame: Frame, units: Array, rank_tol: float) -> Spl
     outside = max(outside, float(np.abs(frame.equations @ common).max(initial=0.0)))
     own = np.linalg.norm(B / units[:, None], axis=0)  # of columns that are not yet comparable
     inner = U.T @ E @ (B / own)
-    try:
-        inverse = np.asarray(np.linalg.inv(inner), dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return None
+    inverse = inverses(inner)
     norms = [
         float(np.linalg.norm(part, axis=(1, 2)).max(initial=0.0)) for part in (inner, inverse)
     ]
