@@ -31,3 +31,24 @@ def inverses(matrices: Array) -> Array:
             with suppress(np.linalg.LinAlgError):
                 out[k] = np.linalg.inv(one)
         return out
+
+
+def axes_of(columns: Array) -> IntArray | slice | None:
+    """Which coordinate axes columns (n, d) are, None where they are something else."""
+    if np.count_nonzero(columns) != columns.shape[1] or not (columns.sum(axis=0) == 1.0).all():
+        return None
+    axes = columns.argmax(axis=0)
+    one_by_one = len(axes) > 0 and (np.diff(axes) == 1).all()  # then nothing is copied
+    return slice(axes[0], axes[-1] + 1) if one_by_one else axes
+
+
+def across(matrix: Array, columns: Array) -> Array:
+    """The product with columns (n, d), of which coordinate axes only choose."""
+    axes = axes_of(columns)
+    return matrix @ columns if axes is None else matrix[:, :, axes]
+
+
+def down(rows: Array, matrix: Array) -> Array:
+    """The product of rows (d, n) with a matrix, in the same way."""
+    axes = axes_of(rows.T)
+    return rows @ matrix if axes is None else matrix[:, axes]

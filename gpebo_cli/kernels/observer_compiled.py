@@ -10,11 +10,11 @@ from gpebo_cli.kernels.arrays import Array
 _SMALL = 24  # states, up to which NumPy's calls cost more than plain loops
 
 
-def in_frame(*arguments: Array) -> tuple[Array, ...]:
+def in_frame(*arguments: Array) -> tuple[Array, ...] | None:
     """In C."""
     E, A, B, F, C, rows, scale, *_, kernel, equations = arguments
     if len(rows) > _SMALL or len(equations) + len(scale) < kernel.shape[1]:
-        return observer_numpy.in_frame(*arguments)
+        return None
     of_A = max(len(A), len(C))
     found: tuple[Array, ...] = _compiled.in_frame(
         *arguments, len(E), of_A, max(len(B), len(F)), max(len(E), of_A)

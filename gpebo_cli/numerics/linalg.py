@@ -12,7 +12,7 @@ from math import prod
 import numpy as np
 
 from gpebo_cli.kernels import signals
-from gpebo_cli.kernels.arrays import inverses
+from gpebo_cli.kernels.arrays import axes_of, inverses
 from gpebo_cli.model.descriptor import Array, BoolArray
 
 _CANCELLED = 1e-13  # of the terms of an entry: what is left is rounding
@@ -63,8 +63,10 @@ def taylor_product(a: Array, b: Array) -> Array:
 def exact_product(left: Array, right: Array) -> Array:
     """left @ right (N, i, k), for matrices (N or 1, i, j) and (N or 1, j, k), without rounding.
 
-    What is not zero in a row of ``left`` counts as being of that row's size.
+    What is not zero in a row of ``left`` counts as being of that row's size; axes only choose.
     """
+    if len(left) == 1 and (axes := axes_of(left[0].T)) is not None:
+        return right[:, axes]
     size = largest_over_time(left).max(axis=1, initial=0.0)[:, None]
     return without_rounding(left @ right, size * ((left != 0.0) @ np.abs(right)))
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.arrays import inverses, joined
+from gpebo_cli.kernels.arrays import across, axes_of, inverses, joined
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -177,10 +177,13 @@ def _in_frame(
     model: Equations, rows: Array, scale: Array, frame: Frame, rank_tol: float
 ) -> ObserverMatrices | None:
     """What :func:`_by_steps` finds in the frame of E; None where singular values have to decide."""
-    (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
-     from_signals) = kernels.observer.in_frame(
+    found = kernels.observer.in_frame(
         *model[:5], rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
     )
+    if found is None:
+        return None
+    (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
+     from_signals) = found
     outside, inner, inverse = sizes.tolist()
     size = 0.0 if outside == 0.0 else float(np.abs(model.E / rows[:, None]).max(initial=0.0))
     weakest = float(injectivity.min(initial=np.inf))
@@ -199,7 +202,7 @@ def _by_steps(
     rank_tol: float, like: ObserverMatrices | None, frame: Frame | None, slope: Callable[[], Array],
 ) -> ObserverMatrices:
     """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
-    q, r = system.q, system.r
+    r = system.r
     E, A, B, F, C, D, H, hidden = model
     rows = units.equations[:, None]
     if (rows != 1.0).any():
@@ -214,7 +217,7 @@ def _by_steps(
         known = None if like is None else like.split
         split = split_by_svd(system, E, slope() / rows, t, units.states, rank_tol, known)
 
-    L, pinv, basis = split.equations, split.pinv, split.basis
+    L, basis = split.equations, split.basis
     # 0 = 𝒜 x + g_y + G θ: equations without derivatives, hidden constraints, outputs.
     exact = [exact_product(L, A)], [exact_product(L, B)], [exact_product(L, F)]
     if hidden is not None:
@@ -224,7 +227,9 @@ def _by_steps(
     algebraic, of_inputs, G = (
         joined(*part, last, axis=1) for part, last in zip(exact, (C, D, H), strict=True)
     )
-    on_basis = without_rounding(algebraic @ basis, np.abs(algebraic) @ np.abs(basis))
+    on_basis = across(algebraic, basis)
+    if axes_of(basis) is None:
+        without_rounding(on_basis, np.abs(algebraic) @ np.abs(basis))
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
@@ -235,27 +240,13 @@ def _by_steps(
         Q1, K, injectivity = _eliminate(*arguments)
     if hidden is not None:
         Q1[:, Q1.shape[1] - r :] = 0.0  # y is not in it, and neither is its rounding
-    Lambda = exact_product(pinv, A)  # Λ = E⁺A + Ṗ
-    if split.turn is not None:
-        Lambda = Lambda + split.turn
-    # [A_0 | D_0 | of u and y] = [Λ | E⁺F | E⁺B, 0] − Λ K [𝒜 | G | g_signals]
-    direct = joined(
-        Lambda @ basis, exact_product(pinv, F), exact_product(pinv, B),
-        np.zeros((1, len(basis.T), r)), axis=2,
-    )
-    through = joined(on_basis, G, g_signals, axis=2)
-    inward = Lambda @ K, transpose(Q1) @ through
-    whole = without_rounding(
-        direct - inward[0] @ inward[1], np.abs(direct) + np.abs(inward[0]) @ np.abs(inward[1])
-    )
-    k = basis.shape[1]
-    dynamics = whole[:, :, :k]
+    dynamics, from_unknowns, from_signals = _moving(split, A, F, B, Q1, K, on_basis, G, g_signals)
     found = ObserverMatrices(
         split=split,
         output_scale=scale,
-        dynamics=dynamics[:1] if len(E) == len(A) == len(C) == 1 and hidden is None else dynamics,
-        from_unknowns=whole[:, :, k : k + q],
-        from_signals=whole[:, :, k + q :],
+        dynamics=dynamics,
+        from_unknowns=from_unknowns,
+        from_signals=from_signals,
         algebraic=algebraic,
         on_basis=on_basis,
         g_signals=g_signals,
@@ -265,6 +256,35 @@ def _by_steps(
         injectivity=injectivity,
     )
     return found if hidden is None else _held(found, units.states, rank_tol)
+
+
+def _moving(
+    split: Split, A: Array, F: Array, B: Array, Q1: Array, K: Array, *equations: Array
+) -> list[Array]:
+    """[BᵀA_0 B, BᵀD_0, of u and y] = [Λ B, E⁺F, [E⁺B 0]] − Λ K [𝒜 B, G, g_signals].
+
+    Λ = E⁺A + Ṗ, K = ``K`` Q1ᵀ; the last three matrices are the ``equations``. Times (N or 1).
+    """
+    Lambda = split.inward(A)
+    if split.turn is not None:
+        Lambda = Lambda + split.turn
+    of_B = split.inward(B)
+    none = np.zeros((1, of_B.shape[1], equations[2].shape[2] - B.shape[2]))
+    direct = [across(Lambda, split.basis), split.inward(F), joined(of_B, none, axis=2)]
+    given = K.any(axis=(0, 2))
+    back = Lambda[:, :, given] @ K[:, given]
+    moved = back.any(axis=(0, 2))  # of many states few are moved by those that are eliminated
+    if not moved.any():
+        return direct
+    back, found = back[:, moved], list[Array]()
+    for own, seen in zip(direct, equations, strict=True):
+        through, before = transpose(Q1) @ seen, own[:, moved]
+        after = without_rounding(
+            before - back @ through, np.abs(before) + np.abs(back) @ np.abs(through)
+        )
+        found.append(np.array(np.broadcast_to(own, (len(after), *own.shape[1:]))))
+        found[-1][:, moved] = after
+    return found
 
 
 def _held(found: ObserverMatrices, units: Array, rank_tol: float) -> ObserverMatrices:

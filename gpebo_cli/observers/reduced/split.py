@@ -8,13 +8,13 @@ dual (k, n), dual B = I and dual P = dual. Coordinate axes are their own dual.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.arrays import inverses
+from gpebo_cli.kernels.arrays import across, axes_of, down, inverses
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -42,6 +42,14 @@ class Split:
     kernel: Array  # (N, n, n_b) orthonormal in comparable units
     projector: Array  # (N, n, n) P
     frame: Frame | None  # None where kernel or range turn
+    scales: Array | None = None  # (N, n_a) of rows of E along axes, if each has one such state
+
+    def inward(self, matrix: Array) -> Array:
+        """E⁺ times a matrix (N or 1, n, ·), as z has it, (N or 1, k, ·)."""
+        if self.scales is None or self.frame is None:
+            return exact_product(self.pinv, matrix)
+        part = down(self.frame.range.T, matrix)
+        return part if (self.scales == 1.0).all() else part / self.scales[:, :, None]
 
     def coordinates(self, states: tuple[str, ...], units: Array) -> tuple[str, ...]:
         """Names of w's coordinates z, (k,), from those of the states and their units (n,)."""
@@ -125,20 +133,28 @@ def split_in_frame(E: Array, frame: Frame, units: Array, rank_tol: float) -> Spl
     None where kernel, range or rank are not those of the frame at one of the times.
     """
     B, U = frame.domain, frame.range
-    kernel, common = frame.kernel, E * units
-    size, outside = (
-        float(np.abs(part).max(initial=0.0)) for part in (common, E @ kernel)
-    )
-    outside = max(outside, float(np.abs(frame.equations @ common).max(initial=0.0)))
+    beside = across(E, frame.kernel), down(frame.equations, E) * units
+    outside = max(float(np.abs(part).max(initial=0.0)) for part in beside)
+    size = 0.0 if outside == 0.0 else float(np.abs(E * units).max())
     own = np.linalg.norm(B / units[:, None], axis=0)  # of columns that are not yet comparable
-    inner = U.T @ E @ (B / own)
-    inverse = inverses(inner)
+    inner = across(down(U.T, E), B) / own
+    diagonal = np.einsum("nii->ni", inner)
+    alone = np.count_nonzero(inner) == np.count_nonzero(diagonal) == diagonal.size
+    inverse = (1.0 / diagonal)[:, :, None] * np.eye(len(own)) if alone else inverses(inner)
     norms = [
         float(np.linalg.norm(part, axis=(1, 2)).max(initial=0.0)) for part in (inner, inverse)
     ]
     if not fits(outside, size, B.shape[1], norms[0], norms[1], rank_tol):
         return None
-    return within_frame(frame, inverse / own[:, None] @ U.T)
+    pinv = np.zeros((len(E), len(own), len(units)))
+    if (axes := axes_of(U)) is not None:
+        pinv[:, :, axes] = inverse / own[:, None]
+    else:
+        np.matmul(inverse / own[:, None], U.T, out=pinv)
+    found = within_frame(frame, pinv)
+    if alone and axes is not None and frame.remaining is None:
+        return replace(found, scales=diagonal * own)
+    return found
 
 
 def fits(
