@@ -153,6 +153,7 @@ def _completed(
     if noisy:
         seeds = more.get("noise")
         metrics = accuracy.standing(estimation, metrics, gains, result.system, seeds)
+    on_demand = {"estimable": more.pop("estimable")}  # another copy would ask for it
     result = replace(
         result, excitation=excitation, estimation=estimation, metrics=metrics, **more
     )
@@ -172,7 +173,7 @@ def _completed(
     return replace(
         result, assumptions=lambda: (*of_source(), *of_observer()),
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
-        warnings=lambda: (*warned, *estimation.warnings),
+        warnings=lambda: (*warned, *estimation.warnings), **on_demand,
     )
 
 

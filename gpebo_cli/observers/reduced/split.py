@@ -45,7 +45,7 @@ class Split:
     scales: Array | None = None  # (N, n_a) of rows of E along axes, if each has one such state
 
     def inward(self, matrix: Array) -> Array:
-        """E⁺ times a matrix (N or 1, n, ·), as z has it, (N or 1, k, ·)."""
+        """E⁺ times a matrix (N, n, c) as z has it, (N, k, c)."""
         if self.scales is None or self.frame is None:
             return exact_product(self.pinv, matrix)
         part = down(self.frame.range.T, matrix)
