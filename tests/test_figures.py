@@ -234,9 +234,9 @@ def test_a_band_has_both_its_edges_in_the_figure_and_in_the_table() -> None:
     assert [line.get_ydata()[0] for line in axes.lines[:2]] == [0.5, -0.5]
     low, high = axes.get_xlim()
     assert (low < t[0], high > t[-1]) == (True, True), "whole dots at either end"
-    [block] = blocks([panel])
-    assert [c.values[0] for c in block.columns] == [0.5, -0.5]
-    assert [c.name for c in block.columns] == ["y: band", "y: band, lower edge"]
+    [[_, *columns]] = blocks([panel])
+    assert [c.values[0] for c in columns] == [0.5, -0.5]
+    assert [c.name for c in columns] == ["y: band", "y: band, lower edge"]
 
 
 def test_power_of_ten_stands_with_the_unit() -> None:

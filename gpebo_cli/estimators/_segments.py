@@ -97,27 +97,9 @@ def estimate(
     return Chain(tuple(parts), regression.resets)
 
 
-@dataclass(frozen=True, eq=False)
-class Gone:
-    """Estimates of every case that are at hand, with what was mixed."""
-
-    values: Array  # (cases, M, p)
-    shown: Array  # (k,) some of their times
-    mixed: Array | None  # Δ (1 or cases, k)
-    requirement: Requirement
-
-    def delta(self, t: Array) -> Array | None:
-        """Δ (1 or cases, j) at some of the times that were to be shown, (j,)."""
-        return None if self.mixed is None else self.mixed[:, np.searchsorted(self.shown, t)]
-
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, (g, M, p)."""
-        return self.values[cases]
-
-
 def in_windows(
     estimator: Estimator, regression: LinearRegression, t: Array, shown: Array
-) -> Gone | None:
+) -> Found | None:
     """Estimates at the times t (M,) of a long regression, window by window; None: not so.
 
     What an estimator holds is that of one window; from one to the next it goes on as after a reset
@@ -147,7 +129,7 @@ def in_windows(
     first = next(running)
     requirement = first.over(chain([first], running), regression.mesh.span)
     mixed = None if deltas[0] is None else np.concatenate([d for d in deltas if d is not None], 1)
-    return Gone(np.concatenate(etas, axis=1), shown, mixed, requirement)
+    return Found(np.concatenate(etas, axis=1), requirement, mixed, shown)
 
 
 def errors(

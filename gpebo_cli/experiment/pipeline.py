@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from typing import Self
 
@@ -46,25 +47,20 @@ class Stage(str):
     share: float
 
 
-@dataclass
-class _Clock:
-    """Seconds per stage; the only mutable thing in a run."""
+@contextmanager
+def _timed(
+    seconds: dict[str, float], progress: Callable[[str], None], limit: float, name: str
+) -> Iterator[Pace]:
+    """A stage that tells how it gets on; how long it took goes to ``seconds``, by its name."""
+    since = perf_counter()
+    progress(name)
 
-    progress: Callable[[str], None]
-    limit: float  # of a loop in seconds
-    seconds: dict[str, float] = field(default_factory=dict)
+    def getting_on(share: float) -> None:
+        if share < 1.0:
+            progress(Stage(name, share))
 
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[Pace]:
-        since = perf_counter()
-        self.progress(name)
-
-        def getting_on(share: float) -> None:
-            if share < 1.0:
-                self.progress(Stage(name, share))
-
-        yield lambda count, what: paced(count, what, self.limit, getting_on)
-        self.seconds[name] = perf_counter() - since
+    yield lambda count, what: paced(count, what, limit, getting_on)
+    seconds[name] = perf_counter() - since
 
 
 @one_thread
@@ -96,7 +92,8 @@ def run_experiment(
     if isinstance(estimator, estimators.Fitting):
         given = system.regression
         estimator.law(given.parametrisation if isinstance(given, TextRegression) else None)
-    stage = _Clock(progress, settings.solver.max_seconds)
+    seconds: dict[str, float] = {}
+    stage = partial(_timed, seconds, progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated
@@ -109,7 +106,7 @@ def run_experiment(
     of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
-        excitation=None, estimation=None, metrics=None, timings=stage.seconds,
+        excitation=None, estimation=None, metrics=None, timings=seconds,
         assumptions=lambda: tuple(of_source()), verdict=source.verdict + note,
         recording=source.recording,
     )

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
+
+import numpy as np
 
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray
@@ -47,11 +49,17 @@ class Unmixed:
 
 
 @dataclass(frozen=True, eq=False)
-class Found(Unmixed):
-    """Estimates of every case that are at hand."""
+class Found:
+    """Estimates of every case that are at hand, with what was mixed."""
 
     values: Array  # (cases, M, p)
     requirement: Requirement
+    mixed: Array | None = None  # Δ (1 or cases, k); None: nothing is mixed
+    shown: Array = field(default_factory=lambda: np.zeros(0))  # (k,) the times of that
+
+    def delta(self, t: Array) -> Array | None:
+        """Δ (1 or cases, j) at some of the times that were to be shown, (j,)."""
+        return None if self.mixed is None else self.mixed[:, np.searchsorted(self.shown, t)]
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases, (g, M, p)."""

@@ -21,7 +21,7 @@ line's width. A gain that is off by 2e-4 does not pass.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -44,22 +44,13 @@ class Column:
 
     name: str
     values: Array
-    log: bool
-    size: float
+    log: bool = False
+    size: float = 0.0
 
 
-@dataclass(frozen=True)
-class Block:
-    """Curves over the same ``x`` (N,)."""
-
-    name: str  # of x
-    x: Array
-    columns: tuple[Column, ...]
-
-
-def blocks(panels: Sequence[Panel]) -> list[Block]:
-    """Everything that is drawn of ``panels``, curves over the same points together."""
-    found: list[Block] = []
+def blocks(panels: Sequence[Panel]) -> list[list[Column]]:
+    """Everything that is drawn of ``panels``, curves over the same points behind these."""
+    found: list[list[Column]] = []
     for panel in panels[:MAX_PANELS]:
         for curve in panel.curves:
             name = f"{panel.label}: {curve.label}" if curve.label else panel.label
@@ -67,33 +58,32 @@ def blocks(panels: Sequence[Panel]) -> list[Block]:
             if curve.down_to is not None:
                 lower = Column(f"{name}, lower edge", curve.down_to, panel.log, panel.size)
                 columns.append(lower)
-            for k, block in enumerate(found):
-                if np.array_equal(block.x, curve.x):
-                    found[k] = Block(block.name, block.x, (*block.columns, *columns))
+            for block in found:
+                if np.array_equal(block[0].values, curve.x):
+                    block.extend(columns)
                     break
             else:
                 x = panel.axis.name
-                found.append(Block(f"{x} of {name}" if found else x, curve.x, tuple(columns)))
+                found.append([Column(f"{x} of {name}" if found else x, curve.x), *columns])
         if panel.vertical is not None:
             time, name = panel.vertical
-            found.append(Block(name, np.array([time]), ()))
+            found.append([Column(name, np.array([time]))])
     return found
 
 
-def blocks_text(table: Sequence[Block], digits: int = 17) -> str:
+def blocks_text(table: Sequence[Sequence[Column]], digits: int = 17) -> str:
     """A header and rows; blocks stand side by side, the shorter ones end in empty cells."""
-    header = [name for block in table for name in (block.name, *(c.name for c in block.columns))]
-    columns = [v for block in table for v in (block.x, *(c.values for c in block.columns))]
-    cells = ([files.cell(value, digits) for value in column.tolist()] for column in columns)
-    return files.csv_text([header, *zip_longest(*cells, fillvalue="")])
+    columns = [column for block in table for column in block]
+    cells = ([files.cell(value, digits) for value in c.values.tolist()] for c in columns)
+    return files.csv_text([[c.name for c in columns], *zip_longest(*cells, fillvalue="")])
 
 
 def reference_text(panels: Sequence[Panel]) -> str:
     """The first block in 41 rows and 10 digits: small enough to be committed."""
     first = blocks(panels)[0]
-    rows = np.unique(np.linspace(0, len(first.x) - 1, _REFERENCE_ROWS).round().astype(np.intp))
-    columns = tuple(Column(c.name, c.values[rows], c.log, c.size) for c in first.columns)
-    return blocks_text([Block(first.name, first.x[rows], columns)], digits=10)
+    last = len(first[0].values) - 1
+    rows = np.unique(np.linspace(0, last, _REFERENCE_ROWS).round().astype(np.intp))
+    return blocks_text([[replace(c, values=c.values[rows]) for c in first]], digits=10)
 
 
 def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
@@ -102,14 +92,14 @@ def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
     Yields:
         One line per curve: which one, where it differs most and by how much.
     """
-    block = blocks(panels)[0]
-    table = read_columns(reference, block.name)
-    x, ours = table.pop(block.name), {column.name: column for column in block.columns}
+    over, *columns = blocks(panels)[0]
+    table = read_columns(reference, over.name)
+    x, ours = table.pop(over.name), {column.name: column for column in columns}
     for name in ours.keys() - table.keys():
         yield f"{name}: there is no such curve in the reference"
-    near = np.abs(block.x[:, None] - x).argmin(axis=0)
-    if not np.allclose(block.x[near], x, rtol=1e-9, atol=1e-9 * float(np.ptp(block.x))):
-        yield f"{block.name} does not have the values of the reference among its own"
+    near = np.abs(over.values[:, None] - x).argmin(axis=0)
+    if not np.allclose(over.values[near], x, rtol=1e-9, atol=1e-9 * float(np.ptp(over.values))):
+        yield f"{over.name} does not have the values of the reference among its own"
         return
     for name, expected in table.items():
         column = ours.get(name)
@@ -117,7 +107,7 @@ def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
             yield f"{name}: there is no such curve any more"
         elif found := _difference(column, near, expected):
             k, text = found
-            yield f"{name}: at {block.name} = {x[k]:.6g} {text}"
+            yield f"{name}: at {over.name} = {x[k]:.6g} {text}"
 
 
 def _difference(column: Column, rows: Array, reference: Array) -> tuple[int, str] | None:

@@ -89,15 +89,11 @@ def _change(change: StateChange) -> dict[str, float]:
 
 def _simulation(system: DescriptorSystem, simulation: SimulationResult | None) -> dict[str, Any]:
     """Index, consistent start and jumps of the simulated plant; None for each of a recording."""
+    numbers = ("index", "strangeness_index", "differential", "algebraic")
     if simulation is None:
-        keys = ("index", "strangeness_index", "differential", "algebraic", "initial_state",
-                "jumps", "impulses")
-        return dict.fromkeys(keys)
+        return dict.fromkeys((*numbers, "initial_state", "jumps", "impulses"))
     return {
-        "index": simulation.index,
-        "strangeness_index": simulation.strangeness_index,
-        "differential": simulation.differential,
-        "algebraic": simulation.algebraic,
+        **{name: getattr(simulation, name) for name in numbers},
         "initial_state": {
             "given": dict(zip(system.states, system.initial_state, strict=True)),
             "used": dict(zip(system.states, simulation.initial_state, strict=True)),
