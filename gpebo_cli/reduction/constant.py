@@ -15,7 +15,8 @@ from math import factorial
 import numpy as np
 
 from gpebo_cli.kernels.arrays import inverses
-from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.series import Sparse
 from gpebo_cli.reduction.explicit import MoreOrdersError, UndecidedError
 from gpebo_cli.reduction.scaling import scales_of
 
@@ -73,20 +74,18 @@ class ConstantForm:
         return np.ones(self.d)
 
     @property
-    def matrix(self) -> tuple[IntArray, IntArray, Array]:
-        """M by its rows: where each begins, its columns, its entries (1, d²)."""
-        d = self.d
-        return np.arange(0, d * d + 1, max(d, 1)), np.tile(np.arange(d), d), self.dynamics.reshape(
-            1, -1
-        )
+    def matrix(self) -> Sparse:
+        """M, with every entry."""
+        d, entries = self.d, self.dynamics.reshape(1, -1)
+        return Sparse(np.arange(0, d * d + 1, max(d, 1)), np.tile(np.arange(d), d), entries)
 
     def reduced(self, x: Array) -> Array:
         """z (d,) of a state (n,)."""
         return np.asarray(self.inverse @ x)
 
     def at_first(self) -> ConstantForm:
-        """The form at the first of the times."""
-        return replace(self, offset=self.offset[:1], f=self.f[:1])
+        """What gives the states at the first of the times."""
+        return replace(self, offset=self.offset[:1])
 
     def states_from(self, z: Array) -> Array:
         """x (N, n, c) from z (N, d, c)."""

@@ -23,6 +23,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.entries import Entries, Places
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.numerics.linalg import largest_over_time
+from gpebo_cli.numerics.series import Sparse
 from gpebo_cli.reduction.scaling import Scaling, balance_entries
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
@@ -47,9 +48,7 @@ class Explicit:
     """x_I' = M x_I + f at N times, and all other states from these."""
 
     states: IntArray  # (d,) I
-    rows: IntArray  # (d + 1,) where each row of M begins among
-    columns: IntArray  # (e,) of its entries, in the order of I
-    entries: Array  # (N or 1, e)
+    matrix: Sparse  # M
     f: Array  # (N or 1, d)
     # x_i −= Σ a_k x_k + φ one after the other: i, {k: a (N or 1,)}, φ (N or 1,)
     others: tuple[tuple[int, Row, Array], ...]
@@ -71,11 +70,6 @@ class Explicit:
         """Units of x_I (d,)."""
         return self.state_units[self.states]
 
-    @property
-    def matrix(self) -> tuple[IntArray, IntArray, Array]:
-        """M by its rows."""
-        return self.rows, self.columns, self.entries
-
     def reduced(self, x: Array) -> Array:
         """x_I (d,) of a state (n,)."""
         shifted = x.copy()
@@ -84,12 +78,10 @@ class Explicit:
         return shifted[self.states]
 
     def at_first(self) -> Explicit:
-        """The form at the first of the times."""
-        return replace(
-            self, entries=self.entries[:1], f=self.f[:1],
-            others=tuple((i, {k: a[:1] for k, a in row.items()}, phi[:1])
-                         for i, row, phi in self.others),
-        )
+        """What gives the states at the first of the times."""
+        return replace(self, others=tuple(
+            (i, {k: a[:1] for k, a in row.items()}, phi[:1]) for i, row, phi in self.others
+        ))
 
     def states_from(self, z: Array) -> Array:
         """x (N, n, c) from x_I (N, d, c)."""
@@ -199,8 +191,8 @@ class _Equations:
         self.values = _divided(self.values, self.order[which], factor[:, :, of_row])
         self.given = _divided(self.given, rows, factor)
 
-    def assembled(self, chosen: IntArray, states: IntArray) -> tuple[IntArray, IntArray, Array]:
-        """Rows ``chosen`` (d,): where each begins, its columns among ``states``, its entries."""
+    def assembled(self, chosen: IntArray, states: IntArray) -> Sparse:
+        """Rows ``chosen`` (d,), with columns ``states`` (d,)."""
         position = np.full(len(self.units), -1)
         position[chosen] = np.arange(len(chosen))
         column = np.full(len(self.units), -1)
@@ -223,7 +215,7 @@ class _Equations:
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
-        return rows, j[order].astype(np.intp), entries
+        return Sparse(rows, j[order].astype(np.intp), entries)
 
     def forcing(self, chosen: IntArray) -> Array:
         """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
@@ -309,7 +301,7 @@ def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
     )
     del A.values, A.rows, others, shifts  # what is known comes in the place of all that
     return Explicit(
-        states, *matrix, A.forcing(chosen), left,
+        states, matrix, A.forcing(chosen), left,
         count, mu, units, min(E.least, A.least), scaling.weights,
     )
 

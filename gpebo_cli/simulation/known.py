@@ -137,14 +137,14 @@ def cut_where(
         known = evaluated(mesh)
 
 
-def least_beside(terms: Array, inputs: IntArray, m: int) -> Array:
+def least_beside(terms: Array, B: Array, rows: IntArray, columns: IntArray, m: int) -> Array:
     """The sizes that m inputs have to compare with, (m,).
 
-    An input whose share of every equation is rounding of the others' is rounding itself: what
-    stands beside it in one, divided by its factor there, are ``terms`` (e,) of ``inputs`` (e,).
+    An input whose share of every equation is rounding of the others' is rounding itself. Beside it
+    stand ``terms`` (n,) of the equations; B has entries of sizes (e,) in rows and columns (e,).
     """
-    least = np.full(m, np.inf)
-    np.minimum.at(least, inputs, terms)
+    least, there = np.full(m, np.inf), B > 0.0
+    np.minimum.at(least, columns[there], terms[rows[there]] / B[there])
     return np.where(np.isfinite(least), least, 0.0)
 
 

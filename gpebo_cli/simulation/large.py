@@ -146,16 +146,12 @@ class _Plant:
         form = self.form
         return replace(
             without_equations(), mu=form.mu, a=self.system.n - form.d, d=form.d,
-            smallest_singular_value=form.pivot, time_invariant=len(self.matrix().entries) == 1,
+            smallest_singular_value=form.pivot, time_invariant=len(form.matrix.entries) == 1,
         )
-
-    def matrix(self) -> series.Sparse:
-        """M."""
-        return series.Sparse(*self.form.matrix)
 
     def matrix_tail(self, mesh: Mesh, form: Explicit | ConstantForm) -> Array:
         """How far each element is from resolving M times its length, where that is below 1 (K,)."""
-        M, units = self.matrix(), form.units
+        M, units = form.matrix, form.units
         if len(M.entries) == 1:
             return np.zeros(mesh.size)
         of_row = np.repeat(np.arange(form.d), np.diff(M.rows))
@@ -203,14 +199,14 @@ def _simulated(
         return None  # there is nothing to integrate, and the derivative array has all states
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
-    M, units = plant.matrix(), form.units
+    M, units = form.matrix, form.units
     shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), _TINY)
     stiff = bool(np.ceil(mesh.steps / longest).sum() > series.MOST_ELEMENTS)
     if stiff:
         longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
 
     used = plant.found.places["u"][0]
-    beside = _beside_inputs(plant.found, np.abs(system.initial_state))[used]
+    beside = _beside_inputs(plant.found, np.abs(system.initial_state), system.m)[used]
     del form, M
     if bounded:
         mesh = few_elements(system, mesh, cuts, longest)
@@ -242,7 +238,7 @@ def _simulated(
 
     def equation(mesh: Mesh) -> series.Equation:
         form = plant.eliminate(mesh)
-        return plant.matrix(), form.f[:, :, None], ()
+        return form.matrix, form.f[:, :, None], ()
 
     def monitor(values: Array, _extras: tuple[Array, ...]) -> list[Kind]:
         x, y, u = _signals(plant, values)
@@ -252,7 +248,7 @@ def _simulated(
         of_y = np.zeros((system.r, 1))
         np.add.at(of_y, plant.found.places["C"][0],
                   np.abs(C).max(axis=0)[:, None] * least[plant.found.places["C"][1]])
-        shares = SHARE * _beside_inputs(plant.found, size)
+        shares = SHARE * _beside_inputs(plant.found, size, system.m)
         return [(x, least[:, 0]), (y, of_y[:, 0]), (u, shares)]
 
     problem = LinearProblem(
@@ -272,13 +268,12 @@ def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
     raise NotImplementedError  # the equation is given by mesh
 
 
-def _beside_inputs(found: Entries, size: Array) -> Array:
-    """:func:`least_beside` the inputs (m,), with states of some size (n,)."""
+def _beside_inputs(found: Entries, size: Array, m: int) -> Array:
+    """:func:`least_beside` m inputs, (m,), with states of some size (n,)."""
     (i, j), (row, column) = found.places["A"], found.places["B"]
     A, B = (largest_over_time(values[0]) for values in (found.values.A, found.values.B))
-    there, terms = B > 0.0, np.bincount(i, A * size[j], len(size))
-    m = 1 + max([-1, *found.places["u"][0].tolist(), *column.tolist()])
-    return least_beside(terms[row[there]] / B[there], column[there], m)
+    terms = np.bincount(i, A * size[j], len(size)).astype(np.float64)
+    return least_beside(terms, B, row, column, m)
 
 
 def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:

@@ -314,8 +314,7 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     """From the sizes of the states (n,) to :func:`least_beside` the inputs (m,)."""
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
     i, j = B.nonzero()
-    own = B[i, j]
-    return lambda size: least_beside((A @ size)[i] / own, j, B.shape[1])
+    return lambda size: least_beside(A @ size, B[i, j], i, j, B.shape[1])
 
 
 def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:
