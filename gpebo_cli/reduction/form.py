@@ -98,17 +98,17 @@ class EquationForm:
     @classmethod
     def given(
         cls, system: DescriptorSystem, inputs: InputDerivatives | None = None,
-        at: tuple[Array, Array, Array | None] | None = None,
+        t: Array = np.zeros(1), inside: Array | None = None, signals: Array | None = None,  # noqa: B008
     ) -> EquationForm:
         """As given, in the units of the plant at its start: what comes later changes no unit.
 
-        With what is known of derivatives of ``inputs``, and ``at`` the time of the start (1,),
-        where functions that jump are decided, and [u; y] (1, m + r) there for matrices that follow
-        them; None: at 0, without signals.
+        With what is known of derivatives of ``inputs``; the start is the first of the times t (N,),
+        functions that jump are decided at ``inside``, and [u; y] (N, m + r) are for matrices that
+        follow them.
         """
-        t, inside, signals = at or (np.zeros(1), np.zeros(1), None)
+        t, inside = t[:1], (t if inside is None else inside)[:1]
         plain = cls(system, Units.plain(system), inputs=inputs)
-        along = plain.along(t, inside, signals, 0)
+        along = plain.along(t, inside, None if signals is None else signals[:1], 0)
         # Functions from Python need have no derivatives.
         order = 0 if isinstance(system.coefficients, FunctionCoefficients) else _SEEN
         units = units_at(system.coefficients.taylor(t, order, inside, along))

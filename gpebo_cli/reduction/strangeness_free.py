@@ -51,7 +51,7 @@ class StrangenessFree:
     E: Array  # (N or 1, n, n) the model's own
     u: Array  # (N, m) the inputs and
     C: Array  # (N or 1, r, n) the output matrix at the same times
-    direct: Array | None  # (N, r) D u + H θ, what the state has no part in; None: nothing
+    direct: Array  # (N or 1, r) D u + H θ, what the state has no part in
     # What A1 and f1 are the sum of, at the last of so many times as were asked for.
     terms: Array | None  # (M, d, n + 1) sizes; None: none were asked for
 
@@ -192,10 +192,10 @@ def _refuse_undetermined(system: DescriptorSystem, poor: BoolArray, t: Array) ->
         )
 
 
-def direct_part(c: Coefficients, zero: frozenset[str]) -> Array | None:
-    """D u + H θ at N times, (N, r): what no state has part in; None: there is nothing."""
+def direct_part(c: Coefficients, zero: frozenset[str]) -> Array:
+    """D u + H θ at N times, (N, r), or at one where both vanish: what no state has part in."""
     if {"D", "H"} <= zero:
-        return None
+        return np.zeros((1, c.C.shape[2]))
     found: Array = taylor_product(c.D[:1], c.u[:1])[0] + taylor_product(c.H[:1], c.theta[:1])[0]
     return found
 

@@ -146,13 +146,13 @@ def _solved(
         A, f = ivp.underlying_ode(system, structure, t, inside)
         c = system.coefficients.taylor(t, 0, inside)
         seen = c.u[0], c.C[0], direct_part(c, system.coefficients.zero)
-        return LinearEquation(None, A, f[:, :, None], tuple(e for e in seen if e is not None))
+        return LinearEquation(None, A, f[:, :, None], seen)
 
     def monitor(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
-        u, C, *direct = extras
+        u, C, direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        y = _outputs(C, values[..., 0], *direct)
+        y = _outputs(C, values[..., 0], direct)
         size = largest_over_time(values[..., 0], 2)
         least = least_sizes(problem, size[:, None], solver.tol)[:, 0]
         least = largest_over_time(C, 2) @ least
@@ -188,8 +188,8 @@ def _solved(
         solution = own(problem)
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
-    u, C, *direct = solution.extras
-    y = _outputs(C, x, *direct)
+    u, C, direct = solution.extras
+    y = _outputs(C, x, direct)
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure, initial_state=x0,
@@ -284,8 +284,7 @@ def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
 
 def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
-    extras = tuple(e for e in (reduced.u, reduced.C, reduced.direct) if e is not None)
-    f1 = reduced.f1[:, :, None]
+    f1, extras = reduced.f1[:, :, None], (reduced.u, reduced.C, reduced.direct)
     if not reduced.A2.shape[1]:
         return LinearEquation(reduced.E1, reduced.A1, f1, extras, None, reduced.terms)
     constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
@@ -317,11 +316,11 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     return lambda size: least_beside(A @ size, B[i, j], i, j, B.shape[1])
 
 
-def _outputs(C: Array, x: Array, direct: Array | None = None) -> Array:
+def _outputs(C: Array, x: Array, direct: Array) -> Array:
     """y = C x + direct at points (K, s + 1)."""
     (K, points, n), r = x.shape, C.shape[2]
     if C.shape[:2] == (1, 1):
         y = (x.reshape(K * points, n) @ C[0, 0].T).reshape(K, points, r)
     else:
         y = np.matmul(C, x[..., None])[..., 0]
-    return np.asarray(y if direct is None else y + direct)
+    return np.asarray(y + direct)

@@ -182,7 +182,7 @@ def reduced_system(
             piecewise=system.n <= SMALL and len(mesh.windows()) > 1,
         )
     except NotObservableError as error:
-        used = as_given(system, t, inside, at, signals.derivatives)
+        used = EquationForm.given(system, signals.derivatives, t, inside, at)
         left = untouched(used, t, inside, at, solver.rank_tol) if in_part else None
         if left is None:
             raise
@@ -237,7 +237,7 @@ def choose_form(
             at(slice(k, k + AT_ONCE), first)
         return first
 
-    note, given = "", as_given(system, t, inside, signals, derivatives)
+    note, given = "", EquationForm.given(system, derivatives, t, inside, signals)
     given = given if units is None else replace(given, units=units)
     if form != "strangeness_free":
         try:
@@ -254,15 +254,6 @@ def choose_form(
         name = system.inputs[j]
         note += f"; derivatives of {name} are its interpolant's, which amplify its noise"
     return hidden, matrices(hidden), note
-
-
-def as_given(
-    system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
-    derivatives: InputDerivatives | None,
-) -> EquationForm:
-    """The form as given in the units of the first of the times t (N,)."""
-    at = t[:1], inside[:1], None if signals is None else signals[:1]
-    return EquationForm.given(system, derivatives, at)
 
 
 def _reason(error: NotObservableError) -> str:
