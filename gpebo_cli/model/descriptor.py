@@ -9,10 +9,10 @@ D nor H. θ is constant to whoever estimates it; in a simulation it may vary all
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +108,24 @@ class CoefficientSource(Protocol):
         functions come from Python, or need too many cells. What depends on outputs does not count
         here: it is looked at along a solution.
         """
+
+
+@dataclass(frozen=True, eq=False)
+class Changed:
+    """A source whose matrices are another's in part, or along known signals."""
+
+    source: CoefficientSource
+    evaluate: Callable[[Array, int, Array], Coefficients]  # times, order, inside
+    kept: dict[object, object] = field(default_factory=dict)  # what is found out about these
+
+    def taylor(
+        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002
+    ) -> Coefficients:
+        """Evaluate them at the times t (N,); signals do not count."""
+        return self.evaluate(t, order, t if inside is None else inside)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
 
 
 @dataclass(frozen=True)

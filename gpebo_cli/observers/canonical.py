@@ -22,14 +22,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 from scipy.integrate import trapezoid
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
 from gpebo_cli.model.expressions import parse, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -124,7 +124,9 @@ class Canonical:
         of_za = replace(
             system, states=system.states[:n_a], initial_state=system.initial_state[:n_a],
             outputs=tuple(system.outputs[k] for k in suitable),
-            coefficients=_Differential(system, n_a, suitable),
+            coefficients=Changed(
+                system.coefficients, partial(_of_differential, system, n_a, suitable)
+            ),
         )
         own = Trajectory(mesh, signals.outputs.values[:, :, suitable])
         found = Plain().observe(reduced_system(
@@ -159,28 +161,20 @@ class Canonical:
 OBSERVER = Canonical
 
 
-@dataclass(frozen=True, eq=False)
-class _Differential:
-    """The equations of z_a, with some of the outputs, which see nothing else."""
+def _of_differential(
+    system: DescriptorSystem, n_a: int, outputs: list[int], t: Array, order: int, inside: Array
+) -> Coefficients:
+    """The equations of z_a at times t (N,), with some of the outputs, which see nothing else.
 
-    system: DescriptorSystem
-    n_a: int
-    outputs: list[int]
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.system.coefficients, name)
-
-    def taylor(
-        self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None  # noqa: ARG002  none counts
-    ) -> Coefficients:
-        """Evaluate them at the times t (N,) (ModelError: the plant is not in canonical form)."""
-        canonical_blocks(self.system, t, t if inside is None else inside)
-        c, own = self.system.coefficients.taylor(t, order, inside), slice(self.n_a)
-        return c._replace(
-            E=c.E[:, :, own, own], A=c.A[:, :, own, own], B=c.B[:, :, own], F=c.F[:, :, own],
-            C=c.C[:, :, self.outputs, own], phi=c.phi[:, :, own], D=c.D[:, :, self.outputs],
-            H=c.H[:, :, self.outputs],
-        )
+    ModelError: the plant is not in canonical form.
+    """
+    canonical_blocks(system, t, inside)
+    c, own = system.coefficients.taylor(t, order, inside), slice(n_a)
+    return c._replace(
+        E=c.E[:, :, own, own], A=c.A[:, :, own, own], B=c.B[:, :, own], F=c.F[:, :, own],
+        C=c.C[:, :, outputs, own], phi=c.phi[:, :, own], D=c.D[:, :, outputs],
+        H=c.H[:, :, outputs],
+    )
 
 
 def _refuse_beyond(system: DescriptorSystem) -> None:

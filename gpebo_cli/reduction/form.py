@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import compress
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,8 @@ from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import (
     Array,
     BoolArray,
+    Changed,
     Coefficients,
-    CoefficientSource,
     DescriptorSystem,
 )
 from gpebo_cli.model.functions import FunctionCoefficients
@@ -248,24 +248,6 @@ def hidden_constraints(
     )
 
 
-class _Along:
-    """A plant's matrices as functions of time, along signals that are known at some times."""
-
-    def __init__(self, form: EquationForm, t: Array, signals: Array) -> None:
-        self._form, self._t, self._signals = form, t, signals
-        self.kept: dict[object, object] = {}  # what is found out along these signals is theirs
-
-    def taylor(self, t: Array, order: int, inside: Array | None = None) -> Coefficients:
-        """The matrices at the times t (N,), with signals interpolated between the known ones."""
-        inside = t if inside is None else inside
-        seen = np.stack([np.interp(t, self._t, signal) for signal in self._signals.T], axis=1)
-        along = self._form.along(t, inside, seen, order)
-        return self._form.system.coefficients.taylor(t, order, inside, along)
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._form.system.coefficients, name)
-
-
 def strangeness_free(
     given: EquationForm, t: Array, inside: Array, signals: Array | None, *, max_mu: int,
     rank_tol: float, ahead: float = 1.0,
@@ -283,8 +265,12 @@ def strangeness_free(
         signals = None if signals is None else np.repeat(signals, len(t), axis=0)
     known = system
     if system.depends_on_outputs and signals is not None:
-        along = cast("CoefficientSource", _Along(given, t, signals))
-        known = replace(system, coefficients=along)
+        def between(at: Array, order: int, inside: Array) -> Coefficients:
+            """The matrices at times (M,), with signals interpolated between known ones."""
+            seen = np.stack([np.interp(at, t, signal) for signal in signals.T], axis=1)
+            return source.taylor(at, order, inside, given.along(at, inside, seen, order))
+
+        known = replace(system, coefficients=Changed(source, between))
     structure = analyse(known, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol)
     whole = replace(given, structure=structure, derivatives=tuple(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
