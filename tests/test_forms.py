@@ -546,6 +546,43 @@ def test_what_grows_away_from_hidden_constraints_stays_on_them(rate, turn):
     assert estimation.parameters[0, -1, 0] == pytest.approx(0.7, rel=1e-9)
 
 
+def test_rounding_of_hidden_constraints_is_no_signal():
+    """E = P diag(I, N) Q of index 2, all turning, a mode of 1e4: x4 is told by constraints alone.
+
+    What e₀ has part in it is rounding, which no mesh resolves.
+    """
+    def product(left, right):
+        return [[" + ".join(f"({a})*({b})" for a, b in zip(row, column, strict=True) if "0" not in
+                            (a, b)) or "0" for column in zip(*right, strict=True)] for row in left]
+
+    def turned(i, j, angle):
+        whole = [["1" if i == j else "0" for j in range(4)] for i in range(4)]
+        whole[i][i] = whole[j][j] = f"cos({angle})"
+        whole[i][j], whole[j][i] = f"sin({angle})", f"-sin({angle})"
+        return whole
+
+    P = product(turned(3, 0, "1.7*t + 3.7"), turned(1, 2, "2.5*t + 5.5"))
+    Q = product(turned(0, 1, "5 - 0.55*t"), turned(1, 2, "0.2 - 0.06*t"))
+    N = [["1", "0", "0", "0"], ["0", "1", "0", "0"], ["0"] * 4, ["0", "0", "1", "0"]]
+    rates = [["-1e4", "0", "0", "0"], ["0", "-1", "0", "0"], ["0", "0", "1", "0"],
+             ["0", "0", "0", "1"]]
+    slope = [["0" if e == "0" else f"-d({e})" for e in row] for row in Q]
+    A = [[f"{x} + {y}" for x, y in zip(*both, strict=True)] for both in zip(
+        product(P, product(rates, Q)), product(P, product(N, slope)), strict=True)]
+    plant = {
+        "name": "stiff", "states": ["x1", "x2", "x3", "x4"], "inputs": {"u": "sin(t)"},
+        "outputs": ["y1", "y2", "y3", "y4"], "E": product(P, product(N, Q)), "A": A,
+        "B": product(P, [["1e4"], ["1"], ["1"], ["0"]]), "C": np.eye(4).tolist(),
+        "initial_state": [0.5, -1, 0, 0],
+    }
+    found = run(
+        plant, observer={"name": "gpebo", "form": "strangeness_free"},
+        estimator={"name": "least_squares", "f0": 1e-14}, time={"horizon": 2, "samples": 51},
+    ).details
+    error = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1]).max()
+    assert error < found.regression.error_estimate < 1e-6
+
+
 @settings(deadline=None, max_examples=8)
 @given(st.lists(st.integers(-7, 7), min_size=4, max_size=4), st.sampled_from(["0.3", "12"]))
 def test_states_of_very_different_sizes_turn_in_the_kernel_of_E(decades, rate):

@@ -29,7 +29,7 @@ _SIGNS = 3  # choices of them for each kind of error
 CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
 END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
 VALUE = 32.0  # likewise of any value, which are not carried on
-_ROUNDING = 8.0  # units in the last place that cannot be resolved
+ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
@@ -154,7 +154,7 @@ def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:
     if problem.units is None:
         made_of = np.full_like(made_of, made_of.max(initial=0.0))
     least = np.maximum(SHARE * made_of, problem.floor)
-    return np.maximum(least, _ROUNDING * EPS / tol * _through_constraints(problem, made_of))
+    return np.maximum(least, ROUNDING * EPS / tol * _through_constraints(problem, made_of))
 
 
 def _through_constraints(problem: LinearProblem, sizes: Array) -> Array:

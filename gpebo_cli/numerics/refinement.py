@@ -71,13 +71,19 @@ def refine(
             away = np.where(np.isin(mesh.edges, list(fixed)), 0.0, 64 * EPS)
             moved = replace(mesh, edges=mesh.edges + away * np.abs(mesh.edges).max())
             there, other = evaluate(moved, found, np.full(mesh.size, -1))
-            left = float(other[stuck].max())
-            if np.mean(np.minimum(np.abs(other[stuck] / tail[stuck] - 1.0), 1.0)) > _OTHER:
+            change = np.abs(other / np.maximum(tail, EPS) - 1.0)
+            if np.mean(np.minimum(change[stuck], 1.0)) > _OTHER:
+                noisy = poor & (change > _OTHER)
+                rest = poor & ~noisy  # what is merely fast: a transient beside them
+                few = rest.sum() <= _SOME
+                left = float(other[noisy if few else stuck].max())
                 many = (missed > 1).sum() > _MANY
                 if left <= _LOST and many:
-                    return mesh, there, other
-                if many or left * stuck.sum() > _SOME:
-                    t = mesh.points[int(np.argmax(np.where(stuck, other, 0.0))), 0]
+                    if not (few and rest.any()):
+                        return mesh, there, other
+                    poor = rest
+                elif many or left * stuck.sum() > _SOME:
+                    t = mesh.points[int(np.argmax(np.where(noisy, other, 0.0))), 0]
                     raise RoundingError(
                         f"the {name} cannot be resolved near t = {t:.6g}: rounding in its "
                         f"equations is {left:.1e} of it, whatever the elements; accepted is a "

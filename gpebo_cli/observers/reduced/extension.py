@@ -14,6 +14,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
+from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -162,7 +163,10 @@ class _Monitor:
                 f"{_LARGEST:.0e}: A_0 is unstable; use observer.remedy=output_injection, reset or "
                 "current_coordinates, or a shorter time.horizon"
             )
-        for signal, floor in self.latest.kinds(self._reduced.form.units.states, self.axes):
+        reduced, rounding = self._reduced, self._reduced.first.rounding
+        if rounding is not None:
+            rounding = ROUNDING * EPS / reduced.solver.tol * rounding
+        for signal, floor in self.latest.kinds(reduced.form.units.states, self.axes, rounding):
             if signal is not None:
                 yield signal.reshape(*self._whole[0].shape[:2], -1), floor
             else:
@@ -253,9 +257,10 @@ def _assembled(
     *_, elimination, injectivity = map(_over_time, solution.extras)
     smallest, where = weakest(injectivity, elimination)
     at = float(solution.trajectory.mesh.points.ravel()[where])
-    return Extension(
-        solution.trajectory, solution.error_estimate, found, sizes, reduced.units, (smallest, at)
-    )
+    error, rounding = solution.error_estimate, reduced.first.rounding
+    if rounding is not None:
+        error = max(error, found.lost(EPS * rounding))
+    return Extension(solution.trajectory, error, found, sizes, reduced.units, (smallest, at))
 
 
 def _in_units(solution: LinearSolution, units: Array) -> LinearSolution:

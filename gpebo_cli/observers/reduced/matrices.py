@@ -75,6 +75,8 @@ class ObserverMatrices:
     elimination: Array  # (N, n, n_b) H
     # At most the smallest singular value of 𝒜 on ker E relative to ‖𝒜‖, at least 1/√n_b of it.
     injectivity: Array  # (N,)
+    # Units in the last place that v = Q x may be wrong by, for 1 of each state of w.
+    rounding: Array | None = None  # (n, n); None: few
 
     @property
     def outputs(self) -> int:
@@ -84,7 +86,7 @@ class ObserverMatrices:
     @property
     def at_first(self) -> ObserverMatrices:
         """Those at the first time alone, split aside."""
-        constant = {"split", "output_scale"}
+        constant = {"split", "output_scale", "rounding"}
         own = (f.name for f in fields(self) if f.name not in constant)
         return replace(self, **{name: getattr(self, name)[:1] for name in own})
 
@@ -221,7 +223,7 @@ def _by_steps(
     # 0 = 𝒜 x + g_y + G θ: equations without derivatives, hidden constraints, outputs.
     exact = [exact_product(L, A)], [exact_product(L, B)], [exact_product(L, F)]
     if hidden is not None:
-        for part, more in zip(exact, hidden, strict=True):
+        for part, more in zip(exact, hidden[:3], strict=True):
             part.append(more)
         C, D, H = _seen_through(hidden, split.kernel, C, D, H)
     algebraic, of_inputs, G = (
@@ -238,8 +240,12 @@ def _by_steps(
         Q1, K, injectivity = _eliminate_in_part(*arguments, frame.remaining.rank)
     else:
         Q1, K, injectivity = _eliminate(*arguments)
+    rounding = None
     if hidden is not None:
-        Q1[:, Q1.shape[1] - r :] = 0.0  # y is not in it, and neither is its rounding
+        outputs = Q1.shape[1] - r
+        Q1[:, outputs:] = 0.0  # y is not in it, and neither is its rounding
+        of_hidden = transpose(Q1[:, outputs - system.n : outputs])
+        rounding = (np.abs(K) @ np.abs(of_hidden)).max(axis=0) @ hidden.rounding
     dynamics, from_unknowns, from_signals = _moving(split, A, F, B, Q1, K, on_basis, G, g_signals)
     found = ObserverMatrices(
         split=split,
@@ -254,6 +260,7 @@ def _by_steps(
         range=Q1,
         elimination=K,
         injectivity=injectivity,
+        rounding=rounding,
     )
     return found if hidden is None else _held(found, units.states, rank_tol)
 
@@ -315,7 +322,7 @@ def _seen_through(
     through = C @ kernel @ np.linalg.pinv(hidden.states @ kernel)
     left = [
         without_rounding(part - through @ more, np.abs(part) + np.abs(through) @ np.abs(more))
-        for part, more in zip((C, D, H), hidden, strict=True)
+        for part, more in zip((C, D, H), hidden[:3], strict=True)
     ]
     return left[0], left[1], left[2]
 

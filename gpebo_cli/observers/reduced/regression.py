@@ -36,14 +36,16 @@ class Assembled:
     moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
 
     def kinds(
-        self, units: Array | float = 1.0, basis: Array | None = None
+        self, units: Array | float = 1.0, basis: Array | None = None,
+        rounding: Array | None = None,
     ) -> Iterator[tuple[Any, Any]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
         States have ``units`` (n,), in which they are comparable. Signals come one after the other,
         because all of a long recording take much memory.
         States that are coordinates of z along a ``basis`` of axes are not copied: instead of their
-        gain None comes, with the units (k, p) that z without ξ_a is to be measured in.
+        gain None comes, with the units (k, p) that z without ξ_a is to be measured in. What
+        ``rounding`` (n, n) of w leaves of a state is no signal to resolve.
         """
         columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
         rows, Y, psi = self._rows, self.Y, self.psi
@@ -64,6 +66,8 @@ class Assembled:
             own = largest_over_time(self.offset) / self.Y_scale
             states = np.maximum(states, 1e-3 * own)
         states = np.maximum(states, 1e-3 * (self.moving / columns).max(axis=1, initial=0.0))
+        if rounding is not None:
+            states = np.maximum(states, self._through(rounding))
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
         yield self.offset / units, 0.0
@@ -74,6 +78,18 @@ class Assembled:
         # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
         yield (psi**2).sum(axis=1), 1e-3
         yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
+
+    def _through(self, rounding: Array) -> Array:
+        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+        return np.asarray((rounding @ (self.moving / columns)).max(axis=1, initial=0.0))
+
+    def lost(self, rounding: Array) -> float:
+        """Share of a state's size that ``rounding`` (n, n) of w is, at most."""
+        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+        own = (largest_over_time(self.gain) / columns).max(axis=1, initial=0.0)
+        if self.Y_scale > 0.0:
+            own = np.maximum(own, largest_over_time(self.offset) / self.Y_scale)
+        return float((self._through(rounding) / np.where(own > 0.0, own, np.inf)).max(initial=0.0))
 
     def after(self, first: int) -> Assembled:
         """The same without so many of the first times; sizes are still those of all of them."""
