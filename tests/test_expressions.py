@@ -534,6 +534,17 @@ def test_inverse_functions_of_waves_are_triangles_and_saws(
     assert abs(slope[0]) == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize(("text", "same"), [
+    ("sqrt(1 - cos(3*t)**2)", "abs(sin(3*t))"), ("sqrt(-sin(t)**2 + 1)", "abs(cos(t))"),
+    ("sqrt(sin(t)**2)", "abs(sin(t))"), ("acos(0.5*cos(t)*2)", "acos(cos(t))"),
+])
+def test_roots_whose_slope_would_be_nothing_over_nothing_are_known(text: str, same: str) -> None:
+    t = np.linspace(0.0, 7.0, 401)
+    for one, other in zip(derivatives(text, t, 1), derivatives(same, t, 1), strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(*(breakpoints(record([read(x)]), 0.0, 7.0) for x in (text, same)))
+
+
 @pytest.mark.parametrize(
     ("text", "before", "after"),
     [

@@ -142,6 +142,10 @@ def multiply(a: Node, b: Node) -> Node:
     if _is(b, 1.0):
         return a
     factor, other = (a, b) if a.is_number else (b, a)
+    if factor.is_number and other.operation == "multiply":
+        for one, rest in (other.arguments, other.arguments[::-1]):
+            if one.is_number and one.value * factor.value == 1.0:
+                return rest
     affine = None
     if factor.is_number and other.affine:
         affine = (factor.value * other.affine[0], factor.value * other.affine[1])
@@ -170,7 +174,23 @@ def power(a: Node, b: Node) -> Node:
         return ONE
     if b.value == 1.0:
         return a
+    if b.value == 0.5 and (root := _known_root(a)):
+        return root
     return _node("power", a, value=b.value)
+
+
+def _known_root(a: Node) -> Node | None:
+    """|b| where a is b², |cos b| where it is 1 - sin²b: √a has the slope 0/0 where it is zero."""
+    if a.operation == "power" and a.value == 2.0:
+        return function("abs", a.arguments[0])
+    one, other = a.arguments if a.operation == "add" else (a, a)
+    one, other = (one, other) if one.is_number else (other, one)
+    square = other.arguments[0] if other.operation == "negative" else a
+    if _is(one, 1.0) and square.operation == "power" and square.value == 2.0:
+        wave = square.arguments[0]
+        if wave.operation in _OTHER_WAVE:
+            return function("abs", function(_OTHER_WAVE[wave.operation], wave.arguments[0]))
+    return None
 
 
 FUNCTIONS: dict[str, Callable[[float], float]] = {
