@@ -493,9 +493,10 @@ def test_blas_has_one_thread_where_matrices_are_small(cells, one):
 
 
 def test_what_is_estimable_at_all_times_is_looked_at_when_it_is_read(monkeypatch):
-    """Spectra at all output times take as long as the rest of a run."""
+    """Spectra at all output times take as long as the rest of a run; assumptions wait, too."""
     asked = []
-    monkeypatch.setattr("gpebo_cli.experiment.estimation.estimable", lambda *_: asked.append(1))
+    for name in ("estimation.estimable", "sources.of_simulation"):
+        monkeypatch.setattr(f"gpebo_cli.experiment.{name}", lambda *_: asked.append(1))
     result = run(plant(ladder, cells=4), estimator="least_squares", time={"horizon": 1.0})
     assert not asked
     assert result.details.estimable is None

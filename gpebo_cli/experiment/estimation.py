@@ -150,30 +150,24 @@ def _completed(
     Nothing is known of the ``unknown`` parameters and states, ``gains`` are as of
     ``accuracy.standing``, and the ``note`` is for the last line of a run, from "; " on.
     """
+    system, simulation, recording = result.system, result.simulation, result.recording
     if noisy:
-        seeds = more.get("noise")
-        metrics = accuracy.standing(estimation, metrics, gains, result.system, seeds)
-    on_demand = {"estimable": more.pop("estimable")}  # another copy would ask for it
-    result = replace(
-        result, excitation=excitation, estimation=estimation, metrics=metrics, **more
-    )
+        metrics = accuracy.standing(estimation, metrics, gains, system, more.get("noise"))
     # A result that is kept for what it has to tell must not keep what the observer made.
     of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
-    of_observer = partial(
-        of_observation, observed.assumptions, growth, excitation, result.system
-    )
+    of_observer = partial(of_observation, observed.assumptions, growth, excitation, system)
     warned, told = warnings(observed), partial(
-        verdict, excitation, estimation.cases, estimation.requirement, metrics, result.fit,
-        unknown, result.left_out, estimation.active,
+        verdict, excitation, estimation.cases, estimation.requirement, metrics, more["fit"],
+        unknown, more.get("left_out", ()), estimation.active,
     )
-    simulation, recording = result.simulation, result.recording
     notes = observed.note + note + simulation_note(simulation, result.settings.solver.tol)
-    notes += functions_note(result.system, simulation or recording)
+    notes += functions_note(system, simulation or recording)
     notes += recording.note if recording else ""
-    return replace(
-        result, assumptions=lambda: (*of_source(), *of_observer()),
+    return replace(  # once: a copy asks for everything that is not replaced
+        result, excitation=excitation, estimation=estimation, metrics=metrics, **more,
+        assumptions=lambda: (*of_source(), *of_observer()),
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
-        warnings=lambda: (*warned, *estimation.warnings), **on_demand,
+        warnings=lambda: (*warned, *estimation.warnings),
     )
 
 
