@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_systems import random_system
+from test_observer import ROTATING
 
 from gpebo_cli import run
 
@@ -27,7 +28,7 @@ def run_to(plant, count, **settings):
                estimator={"name": "least_squares", "f0": 1e-4}, **settings).details
 
 
-def assert_same_past(one, other, tol=1e-8):
+def assert_same_past(one, other, tol=1e-8, of_estimates=None):
     """Signals, Y and ψ; and estimates to the digits that little data leave.
 
     At its end a run knows the limit from the left alone of what jumps there.
@@ -52,7 +53,7 @@ def assert_same_past(one, other, tol=1e-8):
             assert (left_out[0] == left_out[1]).all()
             if not told[-1].all():
                 break
-        same(np.where(told, a, 0.0), np.where(told, b[: len(a)], 0.0), 1e3 * tol)
+        same(np.where(told, a, 0.0), np.where(told, b[: len(a)], 0.0), of_estimates or 1e3 * tol)
 
 
 @pytest.mark.parametrize("seed", [79, 146])
@@ -78,6 +79,31 @@ def test_of_shipped_plants(plant, way):
     one, other = (run_to(plant, count, observer=observer) for count in (20, 50))
     # The first reset starts from estimates of which few digits are known.
     assert_same_past(one, other, 1e-6 if way == "reset" else 1e-8)
+
+
+@pytest.mark.parametrize("remedy", ["current_coordinates", "output_injection"])
+@pytest.mark.parametrize("plant", ["circuit", "canonical", "descriptor", "duffing", ROTATING])
+def test_of_what_remedies_choose(remedy, plant):
+    """The forgetting of filters and the injection follow from what was until then."""
+    one, other = (
+        run_to(plant, count, observer={"name": "gpebo", "remedy": remedy}) for count in (40, 80)
+    )
+    assert_same_past(one, other, 1e-10, 1e-9)
+
+
+@pytest.mark.parametrize("name", [
+    "gradient", "drem", "lion", "ls_drem", "fct", "mre", "power", "exciting", "instrumental",
+    "annihilator",
+])
+def test_of_any_estimator(name):
+    """With a gain that is given; without one ls_drem takes what all data need."""
+    one, other = (
+        run("circuit", estimator={"name": name, "gamma": 1e3},
+            time={"horizon": count * STEP, "samples": count + 1}).details.estimation
+        for count in (40, 80)
+    )
+    for a, b in ((one.parameters, other.parameters), (one.states, other.states)):
+        np.testing.assert_allclose(b[:, :40], a[:, :40], atol=1e-9)
 
 
 @pytest.mark.parametrize("plant", ["circuit", "descriptor", "window"])

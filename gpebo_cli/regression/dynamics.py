@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import largest_over_time, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
@@ -14,6 +16,9 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 
 _TOLERANCE = 1e-12
 _MAX_ELEMENTS = 200_000
+_LEVELS, _BESIDE_TIES = 24, 0.1234  # of ρ, a decade; none of them is at a round number
+_SHORT = 0.01  # of a decay's own time
+_HALVES = 60  # of the time from one point to the next, in which ρ rises
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +27,7 @@ class Dynamics:
 
     A: Trajectory  # (p, p)
     b: Trajectory  # (p,)
-    forgetting: float  # 1/s ρ: what is known of directions that decay must fade as fast as it grows
+    constants: int  # so many of the parameters, the first ones, do not move
     units: Array  # (p,) in which parameters are comparable
 
 
@@ -34,8 +39,9 @@ def filtered(
         Ω' = −(Λ + ρI)Ω − 𝔸ᵀΩ − Ω𝔸 + Γψᵀψ,    𝒴' = −(Λ + ρI)𝒴 − 𝔸ᵀ𝒴 + Ω𝕓 + Γψᵀy
 
     Nothing in it grows as solutions of η' = 𝔸η do; in directions that decay, Ω would grow as the
-    square of their inverse, which the forgetting ρ makes up for. ``outer`` is [ψᵀψ | ψᵀy]
-    (p, p + 1), and Λ and Γ have the diagonals ``rates`` and ``gains`` (p,).
+    square of their inverse, which the forgetting ρ(t) makes up for, twice the rate of the fastest
+    decay so far (``_forgetting``). ``outer`` is [ψᵀψ | ψᵀy] (p, p + 1), and Λ and Γ have the
+    diagonals ``rates`` and ``gains`` (p,).
     """
     p, units = outer.values.shape[2], dynamics.units
     # It is solved for comparable parameters: what is small in its unit only is no rounding.
@@ -44,27 +50,67 @@ def filtered(
     mesh, A, b = dynamics.A.mesh, dynamics.A.values, dynamics.b.values
     turn = Trajectory(mesh, np.concatenate([A * units / units[:, None], (b / units)[..., None]], 3))
     known, sizes = np.zeros((p, p + 1)) if start is None else own * start, np.zeros((p, p + 1))
-    decay, pieces = np.diag(rates + dynamics.forgetting), list[Trajectory]()
+    pieces, (times, levels) = list[Trajectory](), _forgetting(turn)
+
+    def moving(t: Array, inside: Array) -> tuple[Array, Array, Array]:
+        """Λ + ρI + 𝔸ᵀ and 𝔸 (N, p, p), and 𝕓 (N, p)."""
+        at, rho = turn(t, inside), levels[np.searchsorted(times, inside)]
+        A = at[..., :p]
+        return transpose(A) + (rates + rho[:, None])[:, None] * np.eye(p), A, at[..., p]
+
     for window in outer.mesh.windows():
-        pieces.append(_over(window, outer, decay, gains, turn, known, sizes))
+        within = times[(times > window.span[0]) & (times < window.span[1])]
+        finer = Mesh(with_others(window.edges, within), window.rule)
+        pieces.append(_over(finer, outer, gains, moving, known, sizes))
         known = pieces[-1].final
         sizes = np.maximum(sizes, largest_over_time(pieces[-1].values, 2))
     found = joined(pieces)
     return Trajectory(found.mesh, found.values / own)
 
 
+def _forgetting(turn: Trajectory) -> tuple[Array, Array]:
+    """Times (k,) at which ρ rises, and what it is before, between and after them (k + 1,).
+
+    ρ/2 is the next of 24 rates a decade above the fastest decay of 𝔸 (p, p), in ``turn`` beside 𝕓,
+    at any time so far. A decay that has gone on for less than 0.01 of its own time does not count.
+    """
+    p, start = turn.values.shape[2], turn.mesh.span[0]
+
+    def needed(t: Array, A: Array) -> Array:
+        rate = -np.linalg.eigvals(A[..., :p]).real.min(axis=-1)
+        some = rate * (t - start) > _SHORT
+        level = np.ceil(_LEVELS * np.log10(np.where(some, rate, 1.0)) - _BESIDE_TIES)
+        return np.where(some, level, -np.inf)
+
+    t = turn.mesh.points.ravel()
+    found = needed(t, turn.values.reshape(-1, *turn.values.shape[2:]))
+    levels, times = [-np.inf], list[float]()
+    for k in np.flatnonzero(np.diff(np.maximum.accumulate(found)) > 0.0):
+        while levels[-1] < found[k + 1]:
+            low, high, level = t[k], t[k + 1], float(found[k + 1])
+            for _ in range(_HALVES):
+                middle = 0.5 * (low + high)
+                there = float(needed(middle, turn(np.array([middle])))[0])
+                if there > levels[-1]:
+                    high, level = middle, there
+                else:
+                    low = middle
+            times.append(float(high))
+            levels.append(level)
+    return np.array(times), 2.0 * 10.0 ** ((np.array(levels) + _BESIDE_TIES) / _LEVELS)
+
+
 def _over(
-    mesh: Mesh, outer: Trajectory, decay: Array, gains: Array, turn: Trajectory, start: Array,
-    sizes: Array,
+    mesh: Mesh, outer: Trajectory, gains: Array,
+    moving: Callable[[Array, Array], tuple[Array, Array, Array]], start: Array, sizes: Array,
 ) -> Trajectory:
-    """[Ω | 𝒴] on a window, for [𝔸 | 𝕓] and from ``start`` (p, p + 1), which was of ``sizes``."""
+    """[Ω | 𝒴] on a window, from ``start`` (p, p + 1), which was of ``sizes``."""
     p = len(start)
     eye = np.eye(p)
 
     def of_omega(t: Array, inside: Array) -> LinearEquation:
-        A = turn(t, inside)[..., :p]
-        left = -(decay + transpose(A))
-        M = np.einsum("nij,kl->nikjl", left, eye) - np.einsum("ij,nlk->nikjl", eye, A)
+        decay, A, _ = moving(t, inside)
+        M = -np.einsum("nij,kl->nikjl", decay, eye) - np.einsum("ij,nlk->nikjl", eye, A)
         f = gains[:, None] * outer(t, inside)[..., :p]
         return LinearEquation(None, M.reshape(-1, p * p, p * p), f.reshape(-1, p * p, 1))
 
@@ -76,10 +122,9 @@ def _over(
 
     def of_rhs(t: Array, inside: Array) -> LinearEquation:
         sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
-        moving = turn(t, inside)
-        f = np.einsum("nij,nj->ni", sampled, moving[..., p])
-        f = f + gains * outer(t, inside)[..., p]
-        return LinearEquation(None, -(decay + transpose(moving[..., :p])), f[..., None])
+        decay, _, b = moving(t, inside)
+        f = np.einsum("nij,nj->ni", sampled, b) + gains * outer(t, inside)[..., p]
+        return LinearEquation(None, -decay, f[..., None])
 
     # From the mesh of Ω on: in one of its elements Ω is a polynomial.
     problem = LinearProblem(

@@ -56,6 +56,8 @@ class CurrentCoordinates:
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
         units = np.concatenate([reduced.form.units.unknowns, reduced.units])
+        start = reduced.first.at_first
+        size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
 
         def evaluate(
             mesh: Mesh
@@ -71,8 +73,7 @@ class CurrentCoordinates:
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 # Further rows 0 = Q w, of the size of ψ.
-                size = (a.column_scale * units).max(initial=0.0) / reduced.units[:, None]
-                kernel = size * (np.eye(n) - o.split.projector)
+                kernel = size / reduced.units[:, None] * (np.eye(n) - o.split.projector)
                 rows = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
                 a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, rows]))
             own = A * units / units[:, None]
@@ -88,15 +89,13 @@ class CurrentCoordinates:
         kept = final.kept_rows(system, reduced.regression)
         if rotates:
             kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
-        A_0 = A[:, q:, q:]
-        fastest = float(np.linalg.eigvals(A_0).real.min(initial=0.0))
         return Observation(
             regression=LinearRegression(
                 Y=mesh.trajectory(final.Y[:, kept]),
                 psi=mesh.trajectory(final.psi[:, kept]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
                 scale=final.column_scale,
-                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), -2.0 * fastest, units),
+                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), q, units),
             ),
             state_map=AffineStateMap(
                 mesh.trajectory(final.offset), mesh.trajectory(final.gain),

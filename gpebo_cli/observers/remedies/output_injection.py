@@ -9,14 +9,14 @@ for any K_o(t) whose columns lie in range P. Only A_0, b_0 and D_0 change, and w
 
 By default K_o is that of a Kalman–Bucy filter with unit weights,
 
-    K_o = S cᵀ/c₀²,     S' = A_0 S + S A_0ᵀ + κ² P − S cᵀc S/c₀²,     S(start) = κ P
+    K_o = S cᵀ,     S' = A_0 S + S A_0ᵀ + 0.01 P (A_0 A_0ᵀ + 0.01‖A_0‖² I) P − S cᵀc S
 
-with c₀ the root mean square of ‖c‖ over the horizon and κ twice that of the largest real part of
-A_0's eigenvalues where it is positive (at least four per horizon), so that neither the unit of
-time nor that of the outputs matters. Φ then decays about as fast as it would grow, or twice as
-fast. It is not made faster, because with Φ the excitation of e₀ fades, too. S is the covariance
-of that filter (``_riccati``). It need not be accurate: what counts is that it is one and the same
-smooth function.
+from S = P (A_0 A_0ᵀ)^½ P, in comparable units, which are found at the start. Any such weights make
+Φ bounded and let it decay where outputs see what grows (Kalman & Bucy 1961). These hardly touch
+what decays by itself, and what grows decays about as fast as it would grow. It is not made faster,
+because with Φ the excitation of e₀ fades, too. Nothing is weighed over the horizon: S follows from
+A_0 and c until then. It is the covariance of that filter (``_riccati``), and need not be accurate:
+what counts is that it is one and the same smooth function.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from gpebo_cli.numerics.radau import RadauRule
 from gpebo_cli.observers._base import Observation
 from gpebo_cli.observers._riccati import Filtered, StateSpace, filter_windows
 from gpebo_cli.observers.reduced.matrices import Injection, ObserverMatrices
-from gpebo_cli.observers.reduced.split import units_along
 from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.observers.remedies.plain import Plain
 
-_TOLERANCE = 1e-6  # of S
-_PER_HORIZON = 4.0  # rate of the injection where A_0 is stable
+_TOLERANCE = 1e-8  # of S
+_SHARE = 0.01  # of A_0 A_0ᵀ, and
+_LEAST = 1e-2  # of its trace in all directions
 
 
 @dataclass(frozen=True)
@@ -100,45 +100,39 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     Raises:
         SolverError: S cannot be resolved.
     """
-    mesh, basis, dual = reduced.mesh, reduced.basis, reduced.first.split.dual
-    variances = reduced.units**2
-    horizon = float(mesh.edges[-1] - mesh.edges[0])
-    n, squares, windows = basis.shape[1], np.zeros(2), mesh.windows()
-    for window in windows:
-        o = reduced.matrices(window.points.ravel(), window.inside.ravel())
-        unstable = np.maximum(np.linalg.eigvals(o.dynamics).real.max(axis=1, initial=0.0), 0.0)
-        norms = np.linalg.norm(o.residual @ o.algebraic @ basis * reduced.units, 2, axis=(1, 2))
-        means = (unstable**2).mean(), (norms**2).mean()
-        squares += np.multiply(means, window.points.size / mesh.points.size)
-    kappa = max(2.0 * float(np.sqrt(squares[0])), _PER_HORIZON / horizon)
-    size = max(float(np.sqrt(squares[1])), np.finfo(float).tiny)
+    basis, dual, units = reduced.basis, reduced.first.split.dual, reduced.units
+    weight = float(np.square(reduced.first.output_scale * reduced.form.units.outputs).max())
+    n = basis.shape[1]
+
+    A_0 = reduced.first.at_first.dynamics[0] * units / units[:, None]
+    U, sizes, _ = np.linalg.svd(A_0)
+    inward = dual @ reduced.begin.basis @ reduced.begin.dual @ basis @ (units[:, None] * U)
 
     def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
         o = reduced.matrices(t, inside)
-        c = o.residual @ o.algebraic @ basis / size
+        c = o.residual @ o.algebraic @ basis
         rows = c.shape[1]
-        inside = dual @ o.split.projector @ basis
-        Q = kappa**2 * (inside * variances) @ transpose(inside)
+        inside, A_0 = dual @ o.split.projector @ basis * units, o.dynamics * units / units[:, None]
+        size = _LEAST * np.einsum("nij,nij->n", A_0, A_0)[:, None, None]
+        Q = _SHARE * inside @ (A_0 @ transpose(A_0) + size * np.eye(n)) @ transpose(inside)
+        V = np.broadcast_to(weight * np.eye(rows), (len(t), rows, rows))
         return StateSpace(
             A=np.broadcast_to(o.dynamics, (len(t), n, n)), b=np.zeros((len(t), n, 0)),
             c=np.broadcast_to(c, (len(t), rows, n)), z=np.zeros((len(t), rows, 0)),
-            Q=np.broadcast_to(Q, (len(t), n, n)), N=np.zeros((len(t), n, rows)),
-            V=np.broadcast_to(np.eye(rows), (len(t), rows, rows)),
+            Q=np.broadcast_to(Q, (len(t), n, n)),
+            N=np.zeros((len(t), n, rows)), V=V,
         ), ()
 
-    V = dual @ reduced.begin.basis
-    V = V * units_along(V, reduced.units)
-    S0 = kappa * V @ V.T
     parts = filter_windows(
-        model, np.zeros((n, 0)), S0, windows, tol=_TOLERANCE,
-        max_elements=reduced.solver.max_elements,
-        name=f"output injection for plant {reduced.system.name}", sizes=reduced.units,
+        model, np.zeros((n, 0)), (inward * sizes) @ inward.T, reduced.mesh.windows(),
+        tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
+        name=f"output injection for plant {reduced.system.name}", sizes=units,
     )
-    S = joined([_covariance(part, mesh.rule) for part in parts])
+    S = joined([_covariance(part, reduced.mesh.rule) for part in parts])
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weight = dual @ o.split.projector @ basis @ S(t, inside) / size**2
-        return np.asarray(weight @ transpose(o.algebraic @ basis) @ o.residual)
+        weighted = dual @ o.split.projector @ basis @ S(t, inside) / weight
+        return np.asarray(weighted @ transpose(o.algebraic @ basis) @ o.residual)
 
     return gain, S.mesh
 
