@@ -232,6 +232,20 @@ def test_a_covariance_that_cannot_be_resolved_is_refused_with_what_to_change():
         )
 
 
+def test_elements_in_which_conditioning_is_lost_are_cut():
+    """ζ' = −50 ζ + noise is at rest, but X₁ grows by e⁵⁰ in one second."""
+
+    def model(t, inside):
+        one = np.ones((len(t), 1, 1))
+        return StateSpace(-50.0 * one, 0.0 * one, one, 0.0 * one, 100.0 * one, 0.0 * one, one), ()
+
+    mesh = initial_mesh(0.0, 2.0, [], 2, radau_rule(12))
+    found = run_filter(
+        model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-3, max_elements=1_000
+    )
+    assert np.abs(found.pair.values[:, :, 0, 0]).max() <= 1e3
+
+
 def test_a_covariance_that_becomes_indefinite_is_refused():
     """A 'noise' of negative intensity: P = (1 − t/2) I."""
     one, none = np.ones((1, 1)), np.zeros((2, 2))

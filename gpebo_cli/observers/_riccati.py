@@ -96,23 +96,10 @@ def pair(P: Array, estimate: Array) -> Array:
     return out
 
 
-def _in_front(lost: BoolArray, found: list[Kind]) -> list[Kind]:
-    """The signals to resolve where elements (K,) that lose conditioning have to be cut first.
-
-    What comes after such an element is rounding, and would be cut without end. It is not cut
-    until the front has passed, a few elements at a time.
-    """
-    size = len(lost)
-    if not lost.any():
-        return found
-    judged = np.arange(size) <= int(np.argmax(lost)) + max(4, size // 8)
-    points = found[0][0].shape[1]
-    unresolved = np.zeros((size, points, 1))
-    unresolved[lost & judged] = np.resize([1.0, -1.0], points)[:, None]
-    return [
-        (unresolved, 0.0),
-        *((np.where(judged[:, None, None], signal, 0.0), floor) for signal, floor in found),
-    ]
+def _to_cut(lost: BoolArray, points: int) -> Kind:
+    """A signal that is not resolved where elements (K,) of so many points lose conditioning."""
+    alternating = np.resize([1.0, -1.0], points)[:, None]
+    return np.where(lost[:, None, None], alternating, 0.0), 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +192,8 @@ def run_filter(
         found = [(own.reshape(*own.shape[:2], -1), 0.0), *followed(estimate, extras)]
         n = P.shape[-1]
         grown = np.abs(values[..., :n, :n]).max(axis=(1, 2, 3), initial=0.0)
-        return _in_front(grown > _GROWTH, found)
+        lost = grown > _GROWTH
+        return [_to_cut(lost, P.shape[1]), *found] if lost.any() else found
 
     problem = LinearProblem(
         coefficients, first, signals, name,
