@@ -20,7 +20,7 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.comparison import norm_panels
-from gpebo_cli.results.finished import ErrorCurves
+from gpebo_cli.results.finished import ErrorCurves, largest
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
@@ -229,7 +229,9 @@ def gains(result: RunResult) -> list[Panel]:
         settled = curve(SETTLED, "all", 2)
         known = bool(np.isfinite(settled.y).any())
         times = [Panel("time to ±2σ", (settled,), "s", axis=axis)] if known else []
-    size = max(_parameter_size(result), _state_size(result))
+    truth, seen = estimation.true_parameters, _seen(estimation, _known(result))
+    of_eta = truth[:, ~np.isnan(truth).any(axis=0)]
+    size = max(largest(of_eta), largest(result.signals.states[:, seen]))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
     return _with_legend([
         Panel("final error", over_gain("final_error"), log=True, size=size, axis=axis),
@@ -380,11 +382,8 @@ def _note(estimation: EstimationResult) -> str:
     return f"{MAX_CASES} of {count} cases:" if count > MAX_CASES else ""
 
 
-def _seen(result: RunResult, members: Iterable[int]) -> list[int]:
+def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:
     """Those of the states ``members`` that the observer sees: not all of their estimates NaN."""
-    estimation = result.estimation
-    if estimation is None:
-        return []
     return [i for i in members if not np.isnan(estimation.states[:, :, i]).all()]
 
 
@@ -399,20 +398,6 @@ def _varying_gain(estimation: EstimationResult) -> str | None:
     return varying[0] if usable else None
 
 
-def _parameter_size(result: RunResult) -> float:
-    if result.estimation is None:
-        return 0.0
-    truth = result.estimation.true_parameters
-    known = truth[:, ~np.isnan(truth).any(axis=0)]
-    return float(np.max(np.linalg.norm(known, axis=1), initial=0.0))
-
-
-def _state_size(result: RunResult) -> float:
-    """The largest norm of the states that the observer sees."""
-    seen = result.signals.states[:, _seen(result, _known(result))]
-    return float(np.max(np.linalg.norm(seen, axis=1), initial=0.0))
-
-
 def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
     """Norms of the errors of parameters and of states: a curve per label, run and case."""
     labels, curves = [], []
@@ -421,7 +406,7 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
         if estimation is None:
             continue
         truth, x = estimation.true_parameters, truth_at(result, estimation.t)
-        known, seen = ~np.isnan(truth).any(axis=0), _seen(result, _known(result))
+        known, seen = ~np.isnan(truth).any(axis=0), _seen(estimation, _known(result))
         labels.append(label)
         curves.append(ErrorCurves.of(
             estimation.t, (estimation.parameters[case] - truth)[:, known],
@@ -495,7 +480,7 @@ def _estimate(
 def _state_estimates(
     result: RunResult, estimation: EstimationResult, members: Sequence[int]
 ) -> list[Panel]:
-    signals, known, seen, panels = result.signals, _known(result), _seen(result, members), []
+    signals, known, seen, panels = result.signals, _known(result), _seen(estimation, members), []
     for i in members:
         name = result.system.states[i]
         truth = _truth(result, name, signals.t, signals.states[:, i])
@@ -544,7 +529,7 @@ def _state_errors(
         _error(result, estimation, result.system.states[i],
                estimation.states[:, :, i] - truth[:, i],
                float(np.max(np.abs(truth[:, i]), initial=0.0)))
-        for i in _seen(result, members)
+        for i in _seen(estimation, members)
         if i in known
     ]
 

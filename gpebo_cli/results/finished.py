@@ -58,8 +58,12 @@ class ErrorCurves:
             np.linalg.norm(errors, axis=1) if errors.shape[1] else np.zeros(0)
             for errors in (of_eta, of_x)
         ]
-        sizes = [float(np.linalg.norm(true, axis=1).max(initial=0.0)) for true in (eta, x)]
-        return cls(t, norms[0], norms[1], sizes[0], sizes[1])
+        return cls(t, norms[0], norms[1], largest(eta), largest(x))
+
+
+def largest(values: Array) -> float:
+    """The largest norm over time of values (N, c)."""
+    return float(np.linalg.norm(values, axis=1).max(initial=0.0))
 
 
 @dataclass(frozen=True)
