@@ -29,10 +29,11 @@ from gpebo_cli.model import archive
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.guess import _factor, guess
 from gpebo_cli.recordings.hold import edges, held, recording_mesh
 from gpebo_cli.recordings.load import load
-from gpebo_cli.recordings.table import LineReader, read_table
+from gpebo_cli.recordings.table import LineReader, read_table, seconds
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
@@ -411,6 +412,19 @@ def test_rows_before_all_signals_have_begun_are_left_out(tmp_path, missing, line
         read_table(data, shipped("circuit"))
 
 
+def test_rows_that_repeat_a_time_are_left_out_where_that_is_said(tmp_path):
+    path, rows = tmp_path / "r.csv", pd.DataFrame({"t": [0, 1, 1, 2], "V": [1, 2, 3, 4], "y": 1.0})
+    rows.to_csv(path, index=False)
+    with pytest.raises(ConfigError, match=r"line 4, column t: 1\.0 repeats .* data\.missing=drop"):
+        read_table(DataSettings("csv", str(path)), shipped("circuit"))
+    data = DataSettings("csv", str(path), missing="drop")
+    for one in (data, replace(data, frame=rows)):
+        found = read_table(one, shipped("circuit"))
+        assert (found.left_out, found.samples.inputs[:, 0].tolist()) == (1, [1.0, 2.0, 4.0])
+    told, wrong = LineReader("S", data, shipped("circuit")).feed(path.read_bytes())
+    assert (wrong, [row[1] for row in told]) == ("", [1.0, 2.0, 4.0])
+
+
 def test_dates_are_seconds_after_the_first(tmp_path):
     path = tmp_path / "r.csv"
     days = ["2024-02-28T23:59:59", "2024-02-29 00:00:00,25", "2024-03-01T00:00:00.25Z"]
@@ -420,6 +434,9 @@ def test_dates_are_seconds_after_the_first(tmp_path):
     assert read_table(data, shipped("circuit")).samples.t.tolist() == expected
     rows, wrong = LineReader("S", data, shipped("circuit")).feed(path.read_bytes())
     assert ([row[0] for row in rows], wrong) == (expected, "")
+    others = ["31.5.2024 9:00:00", "31.05.2024 09:00:00,5", "2024-05-31T09:00:00.5000001"]
+    for day, t in zip(others, [0.0, 0.5, 0.5000001], strict=True):
+        assert seconds([day], seconds(others[:1], None)[1])[0] == pytest.approx([t], rel=1e-15)
     path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in [days[0], "29/02/2024"]))
     with pytest.raises(ConfigError, match=r"line 3, column t: '29/02/2024' is not a date"):
         read_table(data, shipped("circuit"))
@@ -650,6 +667,14 @@ def test_a_look_at_a_file_finds_its_columns(tmp_path, name):
     assert {key: getattr(found, key) for key in expected} == expected | more
 
 
+def test_an_output_called_T_is_no_time(tmp_path):
+    plant = {"name": "oven", "states": ["x"], "outputs": ["T"], "E": [[1]], "A": [[-1]],
+             "C": [[1]], "initial_state": {"x": 1}}
+    (tmp_path / "log.csv").write_text("Datum;T\n31.05.2024 9:00:00;1,5\n31.05.2024 9:00:01;2,5\n")
+    found = guess(str(tmp_path / "log.csv"), plant_from_mapping(plant, "oven.yaml"))
+    assert (found.columns, found.time_unit) == ({"t": "Datum", "T": "T"}, "datetime")
+
+
 def test_what_is_guessed_runs_as_it_stands(tmp_path):
     columns = signals_of(simulated(samples=201))
     lines = ["Time / ms;U (mV);I measured;note"]
@@ -737,7 +762,8 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
 
 @pytest.mark.parametrize(("written", "unit", "factor"), [
     ("mV", "V", 1e-3), ("l/min", "l/s", 1 / 60), ("ml/min", "l/h", 0.06), ("A", "V", None),
-    ("m/s", "m", None), ("kg/V", "kg/s", None),
+    ("m/s", "m", None), ("kg/V", "kg/s", None), ("W", "kW", 1e-3), ("W", "mW", 1e3),
+    ("µA", "mA", 1e-3), ("in", "min", None),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):
     assert _factor(written, unit) == (None if factor is None else pytest.approx(factor))
@@ -832,6 +858,22 @@ def test_a_recording_says_whether_what_follows_its_signals_is_bounded(gain, boun
     found = run(plant, data={"t": t, "u": np.sin(t), "y": np.exp(-t)}, estimator="least_squares")
     assert found.details.recording.bounded == bounded
     assert ("nothing bounds what functions that change so often" in found.verdict) != bounded
+
+
+@pytest.mark.parametrize("random", [False, True])
+def test_steps_between_random_times_are_no_pauses(random):
+    steps = np.random.default_rng(1).exponential(0.5, 3000) if random else np.full(3000, 0.5)
+    assert not Rows(np.cumsum(steps)).pauses.any()
+    steps[[10, 2000]] = 20.0
+    assert np.flatnonzero(Rows(np.cumsum(steps)).pauses).tolist() == [9, 1999]
+
+
+def test_rows_that_are_left_out_are_said(tmp_path):
+    t = np.arange(0.0, 4.0, 0.1)
+    y = np.where(t < 0.45, np.nan, np.cos(t))
+    data = {"frame": pd.DataFrame({"t": t, "u": np.sin(t), "y": y}), "missing": "interpolate"}
+    said = run("descriptor", data=data).verdict
+    assert "; 5 rows left out (data.missing=interpolate): they are before the first" in said
 
 
 @pytest.mark.parametrize(("hold", "told"), [

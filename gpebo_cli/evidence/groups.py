@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.rows import PAUSE, Rows
+from gpebo_cli.numerics.rows import Rows
 
 _DEGREE = 3
 _NONE, _NOWHERE = np.zeros(0), np.zeros(0, dtype=np.intp)
@@ -73,7 +73,7 @@ def grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int
         return np.searchsorted(instants, times + near, side="right").clip(1) - 1
 
     steps = np.diff(instants, append=max(end, instants[-1]))
-    pauses = np.flatnonzero(steps > PAUSE * np.median(steps))
+    pauses = np.flatnonzero(rows.pauses)
     fresh = at(starts)
     bounds = np.unique(np.concatenate([
         [0, count - 1, count], at(t), fresh, pauses, (pauses + 1).clip(max=count)

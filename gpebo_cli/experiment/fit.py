@@ -105,6 +105,9 @@ def _explained(
     stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]
     residual = residual - residual.mean(axis=0)
+    typical = np.median(np.abs(residual), axis=0) / 0.6745  # σ of normal noise, whatever few do
+    far = (np.abs(residual) > _FAR * typical) & (typical > 0.0)
+    residual[far] = 0.0  # and hides nothing of the others
     power = (residual**2).sum(axis=0)
     # What an output is used up for leaves rounding, which is no noise.
     count, seen = len(residual), power > _SILENT**2 * (y[::stride] ** 2).sum(axis=0)
@@ -115,12 +118,10 @@ def _explained(
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
     names = frozenset[str]().union(*system.coefficients.signals.values())
-    typical = np.median(np.abs(residual), axis=0) / 0.6745  # σ of normal noise, whatever few do
-    far = (np.abs(residual) > _FAR * typical) & seen & (typical > 0.0)
     return replace(
         fit, far=[
             (name, int(own.sum()), float(t[::stride][np.argmax(own)]))
-            for name, own in zip(system.outputs, far.T, strict=True) if own.any()
+            for name, own in zip(system.outputs, (far & seen).T, strict=True) if own.any()
         ],
         rounded=[
             (name, step) for name, step, own in zip(

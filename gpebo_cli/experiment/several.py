@@ -50,7 +50,7 @@ def joined_source(sources: Sequence[Source]) -> Source:
         ),
         elements=sum(each.elements for each in recordings),
         bounded=all(each.bounded for each in recordings),
-        note="".join(each.note for each in recordings),
+        note="".join(dict.fromkeys(each.note for each in recordings)),
     )
     return replace(
         sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),

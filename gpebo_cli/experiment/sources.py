@@ -13,7 +13,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import of_simulation
 from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure, noise_levels
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
-from gpebo_cli.experiment.verdict import pauses_note, simulation_verdict
+from gpebo_cli.experiment.verdict import pauses_note, rows_note, simulation_verdict
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -111,7 +111,7 @@ def recorded(
             first=float(samples_t[0]), last=float(samples_t[-1]),
             known_states=tuple(system.states[i] for i in table.header.known),
             elements=recording.inputs.mesh.size, bounded=recording.bounded,
-            note=pauses_note(recording.rows),
+            note=rows_note(table.left_out, settings.data.missing) + pauses_note(recording.rows),
         ),
     )
 

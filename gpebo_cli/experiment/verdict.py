@@ -13,7 +13,7 @@ from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, Simul
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
-from gpebo_cli.numerics.rows import PAUSE, Rows
+from gpebo_cli.numerics.rows import Rows
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
@@ -86,9 +86,13 @@ def _explains(fit: Fit, case: int) -> str:
         return ": the estimates explain the data"
     if fit.far:
         told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
+        rest = "" if fit.white else (
+            f"; without them the residual is not white, which they may have made, or {why}"
+        )
         return (
             f": some samples are far from what explains the others, {', '.join(told)}, which "
-            f"suggests gaps that are written as numbers (data.gaps), or a sensor that fails{noise}"
+            "suggests gaps that are written as numbers (data.gaps), or a sensor that fails"
+            f"{noise}{rest}"
         )
     if fit.ratio is not None and fit.ratio < _LESS:
         return f": the residual is far below the noise{noise}"
@@ -139,10 +143,19 @@ def _vague_note(simulated: SimulationResult) -> str:
     )
 
 
+def rows_note(count: int, policy: str) -> str:
+    """What the last line of a run has to say of rows of a recording that were left out."""
+    why = "have gaps or repeat a time" if policy == "drop" else (
+        "are before the first or after the last sample of a column"
+    )
+    return f"; {count} row{'s' * (count > 1)} left out (data.missing={policy}): they {why}" * (
+        count > 0
+    )
+
+
 def pauses_note(rows: Rows) -> str:
     """What the last line of a run has to say of pauses, through which it has no data."""
-    steps = np.diff(rows.t)
-    long = steps[steps > PAUSE * np.median(steps)]
+    long = np.diff(rows.t)[rows.pauses]
     if not len(long):
         return ""
     how, instead = ("signals are interpolated", "") if rows.lines else (

@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 
-PAUSE = 5.0  # times the median step: a longer one
+_PAUSE = 5.0  # times the median step: a longer one is a pause,
+_RARE = 100.0  # unless one in so many files has it by the chance of its uneven rows
 
 
 class Rows(NamedTuple):
@@ -21,6 +22,18 @@ class Rows(NamedTuple):
     def lines(self) -> bool:
         """Whether errors between rows are on straight lines, or near them; else they are held."""
         return self.hold != "zoh"
+
+    @property
+    def pauses(self) -> BoolArray:
+        """Which steps are pauses (N − 1,).
+
+        Steps between random times have exponential tails: so much longer than half of them is as
+        likely once more as a quarter is beyond the middle.
+        """
+        steps = np.diff(self.t)
+        middle, upper = np.quantile(steps, [0.5, 0.75])
+        by_chance = middle + np.log2(_RARE * len(steps)) * (upper - middle)
+        return np.asarray(steps > max(_PAUSE * middle, by_chance))
 
     def intensities(self, t: Array) -> Array:
         """Of white noise that moves integrals as errors of variance 1 do, at times t (M,), in s.

@@ -11,15 +11,15 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from datetime import datetime
+from math import isnan
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.table import MISSING, TIME, check_text, read_file
+from gpebo_cli.recordings.table import DATE, MISSING, TIME, check_text, read_file, seconds
 
 _SEPARATORS = (",", ";", "\t", " ")
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
-_TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "temps", "tiempo")
+_TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "datum", "temps", "tiempo")
 _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
           "h": "h", "hours": "h"}
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
@@ -63,7 +63,7 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     if found.separator != "," and any(commas.fullmatch(cell) for row in rows for cell in row):
         found.decimal = ","
         found.reasons["decimal"] = "numbers such as 1,5"
-    _find_time(header, cells, found)
+    _find_time(header, cells, (*system.inputs, *system.outputs), found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
     every = list(csv.reader(lines[1:], delimiter=found.separator))
@@ -98,23 +98,22 @@ def _number(cell: str, decimal: str) -> float | None:
         return None
 
 
-def _find_time(header: Sequence[str], cells: Sequence[Sequence[str]], found: Guess) -> None:
+def _find_time(
+    header: Sequence[str], cells: Sequence[Sequence[str]], signals: Sequence[str], found: Guess
+) -> None:
     named = [k for k, name in enumerate(header) if _words(name)[:1] and
-             _words(name)[0].casefold() in _TIMES]
+             _words(name)[0].casefold() in _TIMES and name not in signals]
     k = named[0] if named else 0
     found.columns[TIME] = header[k]
     found.reasons[TIME] = "by its name" if named else "the first column"
     numbers = [_number(cell, found.decimal) for cell in cells[k]]
     if any(number is None for number in numbers):
         found.time_unit = "datetime"
-        try:
-            datetime.fromisoformat(cells[k][0].strip())
-            found.reasons["time_unit"] = f"dates such as {cells[k][0].strip()}"
-        except ValueError:
-            found.doubts.append(
-                f"column {header[k]}: {cells[k][0]!r} is neither a number nor a date and time as "
-                "in 2024-05-31T12:00:00"
-            )
+        first = cells[k][0].strip()
+        if not isnan(seconds([first], None)[0][0]):
+            found.reasons["time_unit"] = f"dates such as {first}"
+        else:
+            found.doubts.append(f"column {header[k]}: {first!r} is neither a number nor {DATE}")
         return
     units = [_UNITS[word] for word in _words(header[k])[1:] if word in _UNITS]
     found.time_unit = units[0] if units else "s"
@@ -214,4 +213,8 @@ def _factor(written: str, unit: str) -> float | None:
         factor = _factor(top, wanted)
         if factor is not None and below in _RATES and per in _RATES:
             return factor * _RATES[per] / _RATES[below]
-    return _PREFIXES.get(written.removesuffix(unit)) if written.endswith(unit) else None
+    if written.endswith(unit):
+        return _PREFIXES.get(written.removesuffix(unit))
+    prefix, base = _PREFIXES.get(unit[0]), unit[1:]
+    times = _factor(written, base) if prefix and base and unit != "min" else None
+    return times / prefix if times and prefix else None

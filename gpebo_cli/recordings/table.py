@@ -15,7 +15,9 @@ import os
 import re
 from array import array
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,12 +39,18 @@ _WORDS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}  # as data.
 # ASCII digits only: Python would read １.５, 1_0 and what stands beside a no-break space, too.
 _NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
 MISSING = ("", "-", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
+_REPEATED = "; data.missing=drop leaves out rows whose time repeats"
 _BLANK = b" \t\r"
 # Quotes, and what NumPy takes for spaces or the end of a line; or there are no rows at all.
 _UNUSUAL = re.compile(rb'["\0\v\f\r\x1c-\x1f\x80-\xff]|\A\s*\Z')
 _MOST_BYTES, _MOST_CELLS = 500_000_000, 25_000_000
 _LONGEST_LINE, _MOST_BLANK = 1 << 20, 1000
-_DATE = "a date and time as in 2024-05-31T12:00:00.250"
+DATE = "a date and time as in 2024-05-31T12:00:00.250 or 31.05.2024 12:00:00"
+_DAY_FIRST = re.compile(r"\A\s*([0-9]{1,2})\.([0-9]{1,2})\.([0-9]{4})\b")
+_PLAIN_DATE = re.compile(  # up to microseconds
+    r"[0-9]{4}(?:-[0-9]{2}){2}(?:[T ][0-9]{2}(?::[0-9]{2}){1,2}(?:[.,][0-9]{1,6})?)?"
+    r"(?:Z|[+-][0-9]{2}:[0-9]{2})?"
+)
 
 
 @dataclass(frozen=True)
@@ -75,6 +83,7 @@ class Table:
     samples: Samples
     lines: tuple[int, int]  # of the first and of the last sample
     sha256: str
+    left_out: int  # rows with gaps, or before the first sample of a column
 
 
 def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
@@ -231,10 +240,12 @@ class RowReader:
         ]
         t, (before, line_before) = values[0], self._last
         if t <= before:
+            if t == before and self._data.missing == "drop":
+                return [math.nan] * len(values)
             how = "repeats" if t == before else "is before"
             raise ConfigError(
                 f"{header.source}, line {line}, column {header.names[0]}: {t!r} {how} {before!r} "
-                f"of line {line_before}; times must increase"
+                f"of line {line_before}; times must increase{_REPEATED * (t == before)}"
             )
         if not math.isnan(t):
             self._last = (t, line)
@@ -261,7 +272,7 @@ class RowReader:
         if first and self._data.time_unit == "datetime":
             [value], self._origin = seconds([cell], self._origin)
             if math.isnan(value):
-                raise ConfigError(f"{where}: {shown(cell)} is not {_DATE}")
+                raise ConfigError(f"{where}: {shown(cell)} is not {DATE}")
             return float(value)
         if not plain:
             finite = text.lower().lstrip("+-") in ("nan", "inf", "infinity")
@@ -280,12 +291,24 @@ class RowReader:
 
 def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
     """Dates and times as seconds after ``origin``, by default the first one; NaN: it is none."""
+    points = [_DAY_FIRST.sub(_year_first, cell).strip(" \t") for cell in cells]
+    if all(map(_PLAIN_DATE.fullmatch, points)):
+        with suppress(ValueError):
+            dates = [datetime.fromisoformat(point) for point in points]
+            dates = [date if date.tzinfo else date.replace(tzinfo=UTC) for date in dates]
+            origin = dates[0] if origin is None else origin
+            return np.array([(date - origin).total_seconds() for date in dates]), origin
     import pandas as pd
 
-    points = [cell.replace(",", ".") for cell in cells]  # ISO 8601 has both, pandas only this
+    points = [point.replace(",", ".") for point in points]  # ISO 8601 has both, pandas only this
     times = pd.to_datetime(points, format="ISO8601", utc=True, errors="coerce")
     origin = times[0] if origin is None else origin
     return np.asarray((times - origin).total_seconds(), dtype=np.float64), origin
+
+
+def _year_first(found: re.Match[str]) -> str:
+    day, month, year = found.groups()
+    return f"{year}-{month:0>2}-{day:0>2}"
 
 
 def _without_gaps(data: DataSettings, values: Array) -> BoolArray:
@@ -322,13 +345,14 @@ def _table(
     header: Header, data: DataSettings, values: Array, system: DescriptorSystem, sha256: str,
     first_line: int,
 ) -> Table:
-    kept = np.flatnonzero(_without_gaps(data, values))
+    count, kept = len(values), np.flatnonzero(_without_gaps(data, values))
     if len(kept) < 2:
         raise ConfigError(f"{header.source} has {len(kept)} rows without gaps; 2 are needed")
     if len(kept) < len(values):
         values = values[kept]
     found = samples(header, values, system)
-    return Table(header, found, (first_line + int(kept[0]), first_line + int(kept[-1])), sha256)
+    lines = first_line + int(kept[0]), first_line + int(kept[-1])
+    return Table(header, found, lines, sha256, count - len(kept))
 
 
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
@@ -426,6 +450,8 @@ def _from_frame(
             f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is no number "
             f"within ±{LARGEST:g}; data.missing says what to do about gaps"
         )
+    if data.missing == "drop":
+        values[1:][np.diff(values[:, 0]) == 0.0] = np.nan
     t = values[~np.isnan(values[:, 0]), 0]
     for row in np.flatnonzero(np.diff(t) <= 0)[:1]:
         before, after = t[row : row + 2].tolist()
