@@ -13,6 +13,8 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from gpebo_cli import run
+from gpebo_cli.experiment import bounds as bounds_
+from gpebo_cli.observers import gpebo
 
 TANK = {
     "name": "tank", "states": ["h1", "h2"], "inputs": {"V": "sin(t)"}, "unknowns": {"leak": -0.05},
@@ -184,3 +186,28 @@ def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):
 def test_bounds_that_cannot_be(changes, part):
     with refused(part):
         run(TANK, observer=changes, time={"horizon": HORIZON, "samples": 5})
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_a_long_recording_respects_bounds_in_all_of_its_rows(follows, monkeypatch):
+    """As a short one does between its rows, too, but for what is between them."""
+    plant = {**TANK, "A": [["-0.8 - 0.1*y**2", -0.5], [1, -0.5]]} if follows else TANK
+    t = np.linspace(0.0, HORIZON, 801)
+    made = run(plant, observer="none", time={"horizon": HORIZON, "samples": len(t)})
+    noise = 0.05 * np.random.default_rng(0).standard_normal(len(t))
+    data = {"t": t, "V": made["V"], "y": made["y"] + noise}
+    low = float(made["h1"].min()) + 0.1
+    settings = {
+        "data": data, "estimator": {"name": "least_squares", "f0": F0}, "time": {"samples": 41},
+        "observer": {"name": "gpebo", "form": "given", "bounds": {"states": {"h1": [low, None]}}},
+    }
+    short = run(plant, **settings)
+    monkeypatch.setattr(gpebo, "_LONG", 32)
+    monkeypatch.setattr(bounds_, "_GROUP", 7)
+    found = run(plant, **settings)
+    free = run(plant, **settings | {"observer": {"name": "gpebo", "form": "given"}})
+    for name in ("h1", "h2", "leak"):
+        expected = short.estimates[name][0]
+        moved = np.abs(free.estimates[name][0] - expected).max()
+        assert np.abs(found.estimates[name][0] - expected).max() < 1e-3 * moved
+    assert "held by bounds: h1" in found.verdict

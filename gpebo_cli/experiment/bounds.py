@@ -8,13 +8,13 @@ and the same for the unknowns. M is z f₀I + αG_z of least squares, which make
 estimation with bounds, and G of the other estimators. In z = M^½ (η − η̂) it is a problem of
 least distance, which SciPy's ``nnls`` solves by its active set (Lawson & Hanson, chapter 23). It
 begins with the unknowns' bounds; those of states are added where they are violated, between the
-nodes of the mesh, too, until none is.
+nodes of the mesh, too, until none is. Of a long recording they are looked at in its rows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import ActiveBound
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Samples, Trajectory
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.estimator import Estimates, Weighing
 from gpebo_cli.schema import check_keys, number, unknown
@@ -37,6 +37,7 @@ _STILL = 1e-5  # share of a bracket by which a minimum may be off the row that h
 _PLACES = np.linspace(0.0, 1.0, 9)  # in the bracket of a minimum, of which a round leaves an eighth
 _ZOOMS, _ROUNDS = 8, 200  # to find a minimum; of adding bounds
 _NEAR = 1e-4  # of the horizon: what is as near is told once
+_GROUP = 256  # rows that are looked at only where one of them may be below its bound
 _INFEASIBLE = 1e-9  # residual of the dual problem, whose right-hand side is 1
 
 
@@ -56,6 +57,31 @@ class _Row(NamedTuple):
     time: float | None
     normal: Array  # (p,)
     level: float
+
+
+class _Groups(NamedTuple):
+    """Of rows that follow each other, what is extreme of the normals and levels of each side."""
+
+    low: Array  # (B, groups, p)
+    high: Array
+    level: Array  # (B, groups) the highest
+
+    @classmethod
+    def of(cls, normals: Array, levels: Array) -> _Groups:
+        """Of all rows, (B, M, p) and (B, M)."""
+        starts = np.arange(0, levels.shape[1], _GROUP)
+        return cls(
+            np.minimum.reduceat(normals, starts, axis=1),
+            np.maximum.reduceat(normals, starts, axis=1),
+            np.maximum.reduceat(levels, starts, axis=1),
+        )
+
+    def near(self, eta: Array, size: Array, end: int) -> IntArray:
+        """Rows before the ``end`` in whose groups η (p,) may be below a bound, of sizes (B,)."""
+        least = np.minimum(self.low * eta, self.high * eta).sum(axis=2) - self.level
+        groups = np.flatnonzero((least < _TOLERANCE * size[:, None]).any(axis=0))
+        rows = (groups[:, None] * _GROUP + np.arange(_GROUP)).ravel()
+        return np.asarray(rows[rows < end])
 
 
 def bounded(
@@ -142,13 +168,15 @@ class BoundedEstimates:
         grid = self.t
         normals, levels = np.zeros((0, len(grid), eta.shape[1])), np.zeros((0, len(grid)))
         if self.states:
-            grid = np.union1d(self.state_map.offset.mesh.points.ravel(), grid)
+            mesh, known = self.state_map.offset.mesh, self._rows
+            grid = np.union1d(mesh.points.ravel(), grid) if known is None else known
             normals, levels = self._of_states(grid)
         moving = np.linalg.norm(normals, axis=2)
         most = moving.max(axis=1, initial=0.0)
         size = np.abs(levels).max(axis=1, initial=0.0) + most * np.abs(eta).max(initial=0.0)
         # Where the gain is nothing the state is what was measured, and no estimate changes it.
         levels[moving <= _UNMOVED * most[:, None]] = -np.inf
+        groups = None if self._rows is None else _Groups.of(normals, levels)
         working: list[_Row] = []
         active: list[_Row] = []
         squares, bases = np.linalg.eigh(metric)
@@ -170,8 +198,9 @@ class BoundedEstimates:
                     )
                 active = [rows[i] for i in used]
                 eta[k] = free + vectors @ (z / root)
+                some = slice(end) if groups is None else groups.near(eta[k], size, end)
                 new = self._violated(
-                    normals[:, :end], levels[:, :end], grid[:end], eta[k], size, active
+                    normals[:, some], levels[:, some], grid[some], eta[k], size, active
                 )
                 working = [row for row in active if row.time is not None] + new
                 if not new:
@@ -184,19 +213,30 @@ class BoundedEstimates:
                 told.append(bound)
         return tuple(told)
 
+    @property
+    def _rows(self) -> Array | None:
+        """Times (M,) at which alone the states are known, of a long recording; else None."""
+        offset = self.state_map.offset
+        return offset.t if isinstance(offset, Samples) else None
+
     @cached_property
-    def _signals(self) -> tuple[tuple[Trajectory, Trajectory], ...]:
-        """Gain and offset of what is bounded, and their slopes."""
+    def _signals(self) -> tuple[Trajectory, Trajectory]:
+        """Gain and offset of what is bounded."""
         index = [side.place for side in self.states]
-        mesh = self.state_map.offset.mesh
-        gain = Trajectory(mesh, self.state_map.gain.values[:, :, index][..., self.columns])
-        offset = Trajectory(mesh, self.state_map.offset.values[:, :, index])
-        return (gain, offset), (gain.derivative(), offset.derivative())
+        gain, offset = self.state_map.gain, self.state_map.offset
+        return (
+            replace(gain, values=gain.values[:, :, index][..., self.columns]),
+            replace(offset, values=offset.values[:, :, index]),
+        )
+
+    @cached_property
+    def _slopes(self) -> tuple[Trajectory, Trajectory]:
+        gain, offset = self._signals
+        return gain.derivative(), offset.derivative()
 
     def _of_states(self, t: Array, order: int = 0) -> tuple[Array, Array]:
         """Normals (B, M, p) and levels (B, M) of each side at the times t (M,), or their slopes."""
-        sampler = self.state_map.offset.mesh.sampler(t)
-        gain, offset = (sampler(signal.values) for signal in self._signals[order])
+        gain, offset = (signal(t) for signal in (self._slopes if order else self._signals))
         sign = np.array([side.sign for side in self.states])
         value = 0.0 if order else np.array([side.value for side in self.states])
         return (
@@ -219,21 +259,23 @@ class BoundedEstimates:
         after = np.hstack([margin[:, 1:], wall])
         # A minimum between nodes is not deeper below the lowest than its neighbours are above it.
         height = np.fmax(*(np.where(np.isfinite(side), side, -np.inf) for side in (before, after)))
-        least = margin - np.maximum(height - margin, 0.0)
+        least = margin - (np.maximum(height - margin, 0.0) if self._rows is None else 0.0)
         lowest = (margin <= before) & (margin <= after) & (least < _TOLERANCE * size[:, None])
         side, at = np.nonzero(lowest)
         if not len(at):
             return []
-        low, high = t[np.maximum(at - 1, 0)], t[np.minimum(at + 1, len(t) - 1)]
-        width, which = high - low, (side, np.arange(len(at)))
-        for _ in range(_ZOOMS):  # to where the slope turns positive
-            places = low[:, None] + (high - low)[:, None] * _PLACES
-            N, d = self._of_states(places.ravel(), 1)
-            slope = (N @ eta - d).reshape(len(self.states), *places.shape)[which]
-            first = np.clip((slope < 0.0).sum(axis=1), 1, len(_PLACES) - 1)
-            low, high = (places[which[1], first + step] for step in (-1, 0))
-        found = 0.5 * (low + high)
-        N, d = (each[which] for each in self._of_states(found))
+        found, width, N, d = t[at], np.zeros(len(at)), normals[side, at], levels[side, at]
+        if self._rows is None:
+            low, high = t[np.maximum(at - 1, 0)], t[np.minimum(at + 1, len(t) - 1)]
+            width, which = high - low, (side, np.arange(len(at)))
+            for _ in range(_ZOOMS):  # to where the slope turns positive
+                places = low[:, None] + (high - low)[:, None] * _PLACES
+                N, d = self._of_states(places.ravel(), 1)
+                slope = (N @ eta - d).reshape(len(self.states), *places.shape)[which]
+                first = np.clip((slope < 0.0).sum(axis=1), 1, len(_PLACES) - 1)
+                low, high = (places[which[1], first + step] for step in (-1, 0))
+            found = 0.5 * (low + high)
+            N, d = (each[which] for each in self._of_states(found))
         below = N @ eta - d
         rows: list[_Row] = []
         for i in np.argsort(below):

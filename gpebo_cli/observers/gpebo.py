@@ -88,12 +88,14 @@ class Gpebo:
     ) -> Observation:
         """The regression and the state map, with the remedy."""
         keeps = isinstance(self.remedy, Plain | OutputInjection)
-        keeps &= not (self.bounds or {}).get("states")  # looked at between samples, too
         if not keeps or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
         if not keeps:
             return self._observe(system, signals, solver)
-        return lean(lambda each: self._observe(system, each, solver), system, signals, solver)
+        return lean(
+            lambda each: self._observe(system, each, solver), system, signals, solver,
+            rows=bool((self.bounds or {}).get("states")),
+        )
 
     def _observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings

@@ -37,11 +37,16 @@ _NEAR = 1e-9  # of a step: an edge that is nearer to a sample is that sample
 
 def lean(
     observe: Callable[[Measurements], Observation], system: DescriptorSystem,
-    signals: Measurements, solver: SolverSettings,
+    signals: Measurements, solver: SolverSettings, *, rows: bool = False,
 ) -> Observation:
-    """What ``observe`` finds along the signals, by way of :func:`thinned` ones if there are any."""
+    """What ``observe`` finds along the signals, by way of :func:`thinned` ones if there are any.
+
+    The state map may be asked for at all ``rows``.
+    """
     few = thinned(system, signals, solver)
-    return observe(signals) if few is None else condensed(observe(few), signals, few, solver)
+    if few is None:
+        return observe(signals)
+    return condensed(observe(few), signals, few, solver, rows=rows)
 
 
 def thinned(
@@ -67,11 +72,13 @@ def thinned(
 
 
 def condensed(
-    found: Observation, signals: Measurements, few: Measurements, solver: SolverSettings
+    found: Observation, signals: Measurements, few: Measurements, solver: SolverSettings, *,
+    rows: bool = False,
 ) -> Observation:
     """What is ``found`` along ``few`` signals, those of :func:`thinned`, along all of them.
 
-    Its regression has no resets and is affine in the signals, and so is the state.
+    Its regression has no resets and is affine in the signals, and so is the state, which is known
+    at the long elements' points, or instead at their ends and at all ``rows`` of the signals.
     """
     regression, state_map, errors = found.regression, found.state_map, found.errors
     extension = found.truth.extension if isinstance(found.truth, InitialError) else None
@@ -80,28 +87,42 @@ def condensed(
     ):
         raise TypeError("an observation that says what errors of the signals do to it")
     size = np.abs(extension.values[..., :1]).max(axis=(0, 1))  # of ξ_a, (k, 1)
-    mesh, (rows, p) = regression.mesh, regression.psi.values.shape[2:]
+    mesh, (r, p) = regression.mesh, regression.psi.values.shape[2:]
     Y, offset = regression.Y.values.copy(), state_map.offset.values.copy()
     estimate, count, factor = found.error_estimate, 0, np.zeros((0, p + 1))
+    at_rows: list[tuple[Array, Array]] = []  # times, and the offset there
     for part, added, at_points, instants, error in beyond(errors, mesh, signals, few, size, solver):
         estimate = max(estimate, error)
-        Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :rows, 0]), mesh, part)
-        offset[part] += at_points[:, :, rows:]
+        Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :r, 0]), mesh, part)
+        offset[part] += at_points[:, :, r:]
         at = np.flatnonzero(np.isin(added.mesh.edges[:-1], instants))
         t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
-        full = regression.Y(t, t_in) + added.values[at, 0, :rows, 0]
+        full = regression.Y(t, t_in) + added.values[at, 0, :r, 0]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
         factor = np.asarray(
             np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
         )
         count += len(at)
+        if rows:
+            at_rows += [
+                (t, state_map.offset(t, t_in) + added.values[at, 0, r:, 0]),
+                (mesh.edges[part], offset[part, 0]),
+            ]
     duration = float(mesh.edges[-1] - mesh.edges[0])
+    state_map = replace(state_map, offset=Trajectory(mesh, offset))
+    if rows:
+        times, offsets = zip(*at_rows, (mesh.edges[-1:], offset[-1, -1:]), strict=True)
+        t, first = np.unique(np.concatenate(times), return_index=True)
+        state_map = replace(
+            state_map, offset=mesh.sampled(t, np.concatenate(offsets)[first]),
+            gain=mesh.sampled(t, state_map.gain(t)),
+        )
     return replace(
         found, error_estimate=estimate, respond=None,
         regression=replace(
             regression, Y=Trajectory(mesh, Y), factor=np.sqrt(duration / count) * factor
         ),
-        state_map=replace(state_map, offset=Trajectory(mesh, offset)),
+        state_map=state_map,
     )
 
 
