@@ -198,7 +198,7 @@ def test_a_long_recording_respects_bounds_in_all_of_its_rows(follows, monkeypatc
     data = {"t": t, "V": made["V"], "y": made["y"] + noise}
     low = float(made["h1"].min()) + 0.1
     settings = {
-        "data": data, "estimator": {"name": "least_squares", "f0": F0}, "time": {"samples": 41},
+        "data": data, "estimator": {"name": "least_squares", "f0": F0}, "time": {"samples": 38},
         "observer": {"name": "gpebo", "form": "given", "bounds": {"states": {"h1": [low, None]}}},
     }
     short = run(plant, **settings)

@@ -870,10 +870,29 @@ def test_steps_between_random_times_are_no_pauses(random):
 
 def test_rows_that_are_left_out_are_said(tmp_path):
     t = np.arange(0.0, 4.0, 0.1)
-    y = np.where(t < 0.45, np.nan, np.cos(t))
+    y = np.where((t < 0.45) | (t == t[20]), np.nan, np.cos(t))
     data = {"frame": pd.DataFrame({"t": t, "u": np.sin(t), "y": y}), "missing": "interpolate"}
     said = run("descriptor", data=data).verdict
-    assert "; 5 rows left out (data.missing=interpolate): they are before the first" in said
+    assert "; rows left out (data.missing=interpolate): 5, they are before the first" in said
+    assert "cells filled" not in said
+
+
+def test_cells_that_are_filled_have_no_error_of_their_own():
+    """Where all outputs are missing; straight lines lead across as if the rows were not there."""
+    t, rng = np.linspace(0.0, 8.0, 321), np.random.default_rng(0)
+    made = run("descriptor", observer="none", time={"horizon": 8.0, "samples": 321})
+    frame = pd.DataFrame({"t": t, "u": t, "y": made["y"] + 0.1 * rng.standard_normal(len(t))})
+    frame.loc[(rng.random(len(t)) < 0.3) & (t > 0.0) & (t < 8.0), "y"] = np.nan
+    filled, dropped = (
+        run("descriptor", data={"frame": frame, "missing": policy}, estimator="least_squares")
+        for policy in ("interpolate", "drop")
+    )
+    one, other = (each.details.estimation.states_std[0, -1] for each in (filled, dropped))
+    np.testing.assert_allclose(one, other, rtol=1e-6)
+    assert "cells filled" not in filled.verdict
+    frame.loc[frame.index[frame["y"].notna()][50], "u"] = np.nan
+    told = run("descriptor", data={"frame": frame, "missing": "hold"}).verdict
+    assert "; cells filled (data.missing=hold): 1, which deviations take for measured" in told
 
 
 @pytest.mark.parametrize(("hold", "told"), [

@@ -51,7 +51,7 @@ class Source:
     simulation: SimulationResult | None = None
     recording: RecordingResult | None = None
     rows: Rows | None = None  # of a recording
-    samples: Array | None = None  # (N,) of one recording: the times of its rows
+    samples: Array | None = None  # (N,) of one recording: the times of its rows with an output
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
@@ -104,14 +104,15 @@ def recorded(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
         assumptions=tuple, verdict="", derivatives=recording.derivatives,
-        rows=recording.rows, samples=samples_t,
+        rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
             **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
             rows=len(samples_t), hold=recording.hold,
             first=float(samples_t[0]), last=float(samples_t[-1]),
             known_states=tuple(system.states[i] for i in table.header.known),
             elements=recording.inputs.mesh.size, bounded=recording.bounded,
-            note=rows_note(table.left_out, settings.data.missing) + pauses_note(recording.rows),
+            note=rows_note(table.left_out, table.filled, settings.data.missing)
+            + pauses_note(recording.rows),
         ),
     )
 

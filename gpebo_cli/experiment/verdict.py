@@ -143,13 +143,15 @@ def _vague_note(simulated: SimulationResult) -> str:
     )
 
 
-def rows_note(count: int, policy: str) -> str:
-    """What the last line of a run has to say of rows of a recording that were left out."""
+def rows_note(left_out: int, filled: int, policy: str) -> str:
+    """What the last line of a run has to say of rows that were left out and of filled cells."""
     why = "have gaps or repeat a time" if policy == "drop" else (
         "are before the first or after the last sample of a column"
     )
-    return f"; {count} row{'s' * (count > 1)} left out (data.missing={policy}): they {why}" * (
-        count > 0
+    note = f"; rows left out (data.missing={policy}): {left_out}, they {why}" if left_out else ""
+    return note + (
+        f"; cells filled (data.missing={policy}): {filled}, which deviations take for measured"
+        if filled else ""
     )
 
 
@@ -163,8 +165,8 @@ def pauses_note(rows: Rows) -> str:
     )
     return (
         f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s {how} "
-        f"(data.hold={rows.hold}), which biases estimates if the plant moves meanwhile: take "
-        f"{instead}a file for each part (data.file=[…])"
+        f"(data.hold={rows.hold}), which biases estimates beyond their deviations if the plant "
+        f"moves meanwhile: take {instead}a file for each part (data.file=[…])"
     )
 
 

@@ -239,7 +239,7 @@ class KalmanBucy:
             return reduced_system(system, signals, solver, xi_a0=self.xi_a0, form=self.form)
 
         evidence = lean(lambda each: Plain().observe(reduced_on(each)), system, signals, solver)
-        few = thinned(system, signals, solver)
+        few = thinned(system, _with_pauses(signals), solver)
         known = reduced_on(replace(few or signals, wanted=None))
         mesh, q, split = known.mesh, system.q, known.first.split
         windows = [mesh] if few or signals.asked is None else mesh.windows()
@@ -248,7 +248,7 @@ class KalmanBucy:
         note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
         unknown = noise.rows is not None and not noise.variances.any()
 
-        steps = _steps(noise, mesh if few else None)
+        steps = _steps(noise, mesh)
 
         def reduced(t: Array, inside: Array) -> FilterModel:
             return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)
@@ -366,15 +366,26 @@ def _noise(
     return replace(noise, outputs=np.full(system.r, level)), level
 
 
-def _steps(noise: SignalNoise, mesh: Mesh | None) -> Callable[[Array], Array | float]:
-    """Seconds for each row at times (N,) over the sample time; the same in elements of a mesh."""
+def _with_pauses(signals: Measurements) -> Measurements:
+    """With the ends of pauses among the wanted times: rows beside one do not count as it does."""
+    rows = None if signals.noise is None else signals.noise.rows
+    if rows is None or signals.wanted is None:
+        return signals
+    first, (start, stop) = np.flatnonzero(rows.pauses), signals.span
+    ends = rows.t[np.concatenate([first, first + 1])].clip(start, stop)
+    return replace(signals, wanted=np.union1d(signals.wanted, ends))
+
+
+def _steps(noise: SignalNoise, mesh: Mesh) -> Callable[[Array], Array | float]:
+    """Seconds for each row at times (N,) over the sample time, the same in each element of a mesh.
+
+    Several rows there count by how long each is held: the mean of what moves an integral over all.
+    """
     rows = noise.rows
     if rows is None:
         return lambda _inside: 1.0
-    if mesh is None:
-        return lambda inside: rows.intensities(inside) / noise.sample_time
-    counts = np.diff(np.interp(mesh.edges, rows.t, np.arange(len(rows.t))))
-    seconds = mesh.steps / counts / noise.sample_time
+    variances = np.append(0.0, (rows.intensities(rows.t[:-1]) * np.diff(rows.t)).cumsum())
+    seconds = np.diff(np.interp(mesh.edges, rows.t, variances)) / mesh.steps / noise.sample_time
     return lambda inside: seconds[
         np.searchsorted(mesh.edges, inside, side="right").clip(1, mesh.size) - 1
     ]

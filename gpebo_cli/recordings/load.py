@@ -40,8 +40,8 @@ class Recording:
 
     @property
     def rows(self) -> Rows:
-        """Those of the span, whose ends count as rows."""
-        t, (start, stop) = self.table.samples.t, self.span
+        """Those of the span with an output, whose ends count as rows."""
+        t, (start, stop) = self.table.samples.t[self.table.measured], self.span
         inner = t[(t > start) & (t < stop)]
         return Rows(np.concatenate([[start], inner, [stop]]), self.hold)
 

@@ -84,6 +84,8 @@ class Table:
     lines: tuple[int, int]  # of the first and of the last sample
     sha256: str
     left_out: int  # rows with gaps, or before the first sample of a column
+    filled: int  # cells of inputs and outputs in rows
+    measured: BoolArray  # (N,) that have a sample of an output; the others have no error of it
 
 
 def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
@@ -345,14 +347,18 @@ def _table(
     header: Header, data: DataSettings, values: Array, system: DescriptorSystem, sha256: str,
     first_line: int,
 ) -> Table:
-    count, kept = len(values), np.flatnonzero(_without_gaps(data, values))
+    count, gaps = len(values), np.isnan(values[:, 1 : 1 + system.m + system.r])
+    kept = np.flatnonzero(_without_gaps(data, values))
     if len(kept) < 2:
         raise ConfigError(f"{header.source} has {len(kept)} rows without gaps; 2 are needed")
     if len(kept) < len(values):
         values = values[kept]
     found = samples(header, values, system)
     lines = first_line + int(kept[0]), first_line + int(kept[-1])
-    return Table(header, found, lines, sha256, count - len(kept))
+    gaps = gaps[kept]
+    measured: BoolArray = np.asarray(~gaps[:, system.m :].all(axis=1) | (system.r == 0))
+    filled = int(gaps[measured].sum())
+    return Table(header, found, lines, sha256, count - len(kept), filled, measured)
 
 
 def _read_body(header: Header, data: DataSettings, body: bytes) -> Array:
