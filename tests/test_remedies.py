@@ -450,6 +450,25 @@ def test_remedies_bear_noise_and_weights(remedy):
     assert lost > 1e3 * kept
 
 
+def test_filters_forget_as_fast_as_the_plant_and_not_as_w_is_held_on_constraints():
+    """Of index 3, with noise: the force and the load were lost, as windows were too short."""
+    arm = {
+        "name": "arm", "states": ["q1", "q2", "w1", "w2", "force"], "unknowns": {"load": 0.7},
+        "E": np.diag([1, 1, 3, 1, 0]).tolist(), "F": [[0], [0], [1], [0.5], [0]],
+        "A": [[0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [-5, 0, -1, 0, 1], [0, -5, 0, -1, 2],
+              [1, 2, 0, 0, 0]],
+        "phi": [0, 0, "sin(2*t)", "cos(3*t)", 0], "outputs": ["a", "b"],
+        "C": [[1, 0, 0, 0, 0], [0, 0, 1, 0.2, 0]], "initial_state": [0.5, -0.25, 0, 0, 0],
+    }
+    noise = NoiseSettings(outputs=1e-3, sample_time=0.1)
+    result = run_experiment(Settings(
+        estimator={"name": "least_squares"}, noise=noise, time=TimeSettings(0.0, 3.0, 41),
+        observer={"name": "gpebo", "remedy": "current_coordinates"},
+    ), plant_from_mapping(arm))
+    assert relative_error(result)[20:].max() < 0.03
+    assert result.estimation.parameters[0, -1, 0] == pytest.approx(0.7, abs=0.01)
+
+
 class Outsider:
     """An estimator of another package, with no more than the protocol."""
 

@@ -97,6 +97,7 @@ class EquationForm:
     # Derivatives that hidden constraints contain: (order, input); of each from ``inputs``.
     derivatives: tuple[tuple[int, int], ...] = ()
     inputs: InputDerivatives | None = None
+    held: bool = True  # a term of the observer pulls w onto hidden constraints
 
     @classmethod
     def given(

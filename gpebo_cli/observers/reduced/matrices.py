@@ -169,10 +169,12 @@ def observer_matrices(
         found = _in_frame(model, units.equations, scale, frame, rank_tol)
     if found is not None:
         return found
-    return _by_steps(
+    found = _by_steps(
         system, model, units, scale, t, rank_tol, like, known,
         lambda: form.mass(t, inside, signals, 1)[: len(model.E)],
     )
+    held = form.held and model.hidden is not None
+    return _held(found, units.states, rank_tol) if held else found
 
 
 def _in_frame(
@@ -247,7 +249,7 @@ def _by_steps(
         of_hidden = transpose(Q1[:, outputs - system.n : outputs])
         rounding = (np.abs(K) @ np.abs(of_hidden)).max(axis=0) @ hidden.rounding
     dynamics, from_unknowns, from_signals = _moving(split, A, F, B, Q1, K, on_basis, G, g_signals)
-    found = ObserverMatrices(
+    return ObserverMatrices(
         split=split,
         output_scale=scale,
         dynamics=dynamics,
@@ -262,7 +264,6 @@ def _by_steps(
         injectivity=injectivity,
         rounding=rounding,
     )
-    return found if hidden is None else _held(found, units.states, rank_tol)
 
 
 def _moving(

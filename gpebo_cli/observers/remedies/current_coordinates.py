@@ -47,7 +47,12 @@ class CurrentCoordinates:
     """No Φ: what is estimated moves along with the state."""
 
     def observe(self, reduced: ReducedSystem) -> Observation:
-        """The regression about ζ and its dynamics."""
+        """The regression about ζ and its dynamics.
+
+        Hidden constraints are measured. w need not be held on them: filters would have to forget as
+        fast as that is done.
+        """
+        reduced = replace(reduced, form=replace(reduced.form, held=False))
         system, solver = reduced.system, reduced.solver
         q, n, basis = system.q, system.n, reduced.basis
         rotates = basis.shape[1] > reduced.first.split.rank
