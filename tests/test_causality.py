@@ -88,7 +88,8 @@ def test_of_what_remedies_choose(remedy, plant):
     one, other = (
         run_to(plant, count, observer={"name": "gpebo", "remedy": remedy}) for count in (40, 80)
     )
-    assert_same_past(one, other, 1e-10, 1e-9)
+    # Of the descriptor plant five digits of a double are lost in what is known.
+    assert_same_past(one, other, 1e-10, 1e-8)
 
 
 @pytest.mark.parametrize("name", [
