@@ -237,6 +237,15 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
         np.savetxt(file, table, delimiter=",", header="t,current,v", comments="")
     with pytest.raises(ConfigError, match="1025 samples would take some"):
         run("battery", data={"file": files})
+    # Those that go on from window to window are there each by itself and, wider, all together.
+    monkeypatch.setattr(gpebo, "_LONG", 32)
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 5e-4)
+    sizes = []
+    for some in (files[:1], files):
+        with pytest.raises(ConfigError, match="would take some") as told:
+            run("battery", data={"file": some}, time={"samples": 41})
+        sizes.append(float(str(told.value).split("some ")[1].split(" GB")[0]))
+    assert 4.0 < sizes[1] / sizes[0] < 8.0
 
 
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():

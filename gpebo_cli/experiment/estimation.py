@@ -76,7 +76,10 @@ def continuous(
         seen = Measurements(
             signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
             known.derivatives, known.t if known.recording else None, asked,
-            sum(each.inputs.mesh.points.size for each in source.pieces if each is not known),
+            [
+                (each.inputs.mesh.size, each.inputs.mesh.points.size)
+                for each in source.pieces if each is not known
+            ],
         )
         return observer.observe(system, seen, settings.solver)
 

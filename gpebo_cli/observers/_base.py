@@ -67,7 +67,8 @@ class Measurements:
     wanted: Array | None = None  # (N,) times that results are for; None: all
     # (M,) times at which the state map is asked for, if estimators go on from window to window;
     asked: Array | None = None  # None: any
-    beside: int = 0  # points of the meshes of other recordings, whose results are kept as well
+    # Elements and points of the meshes of other recordings, whose results are kept as well, each
+    beside: Sequence[tuple[int, int]] = ()  # with columns for its own start.
 
     @property
     def mesh(self) -> Mesh:
@@ -100,13 +101,17 @@ class Measurements:
             return
         start, stop = self.span
         n, signals, rank = system.n, system.m + system.r, differential_order(system, start)
-        p, points = system.q + rank, self.mesh.points.size + self.beside
+        p = system.q + rank
+        elements, points = np.sum([(self.mesh.size, self.mesh.points.size), *self.beside], axis=0)
         numbers = times * _HELD * (p + 1) * (n + p + signals) * points
         if self.asked is not None and times == 1.0:
-            # Y, ψ and the signals at all points, and the state map at samples.
-            of_points = (n - rank + system.r) * (p + 1) + signals + 2
-            of_samples = (n + 1) * (p + 2) + signals + _BESIDE
-            numbers = _KEPT * (points * of_points + self.mesh.size * of_samples)
+            # Y, ψ and the signals at all points, and the state map at samples; of several
+            # recordings each one's and all together.
+            widths = {p, p + rank * len(self.beside)}
+            numbers = _KEPT * sum(
+                points * ((n - rank + system.r) * (own + 1) + signals + 2)
+                + elements * ((n + 1) * (own + 2) + signals + _BESIDE) for own in widths
+            )
         check_memory(
             f"what is made of each of the recording's {self.mesh.size} samples", numbers,
             lambda share: f"time.horizon={share * (stop - start):.3g} fits, and observer=gpebo "
