@@ -438,6 +438,7 @@ def time_between(low, high, until=10.0):
 
 @pytest.mark.parametrize(("argument", "inside"), [
     ("y - 0.999999", [(0.999999, 1.0)]),  # comes and goes between two times of a mesh
+    ("y - 1 + 1e-12", [(1 - 1e-12, 1.0)]),  # for 3e-6 s, and this is no rounding
     ("(0.31 - y)*(y - 0.3101)", [(0.31, 0.3101)]),
     ("exp(-((y - 0.3)/1e-4)**2) - exp(-1)", [(0.2999, 0.3001)]),
     ("sin(30*y)", [(2 * k * np.pi / 30, (2 * k + 1) * np.pi / 30) for k in range(-5, 5)]),

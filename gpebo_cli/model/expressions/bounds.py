@@ -38,7 +38,7 @@ _POLYNOMIAL = {"add", "multiply", "negative", "signal", "abs", "sign", "min", "m
 _MOST_ALONG = 1 << 13  # cells along signals, whose bounds no kernel finds, and
 _FOR_EACH = 2  # cells for each element of those, if these are more
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
-_ROUNDING = 1e-12  # of an argument: changes of sign within it are not looked for
+_ROUNDING = 1e-14  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 1 << 16
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
