@@ -7,7 +7,7 @@ The residual c w = y_c of the regression, c = R𝒜 and y_c = −R (g_y + G θ),
 for any K_o(t) whose columns lie in range P. Only A_0, b_0 and D_0 change, and w is still exactly
 ξ_a + ξ_b θ − Φ e₀. K_o decides how fast Φ decays, and does not change what is true.
 
-By default K_o is that of a Kalman–Bucy filter with unit weights,
+By default K_o is that of a Kalman–Bucy filter with small weights,
 
     K_o = S cᵀ,     S' = A_0 S + S A_0ᵀ + 0.01 P (A_0 A_0ᵀ + 0.01‖A_0‖² I) P − S cᵀc S
 
