@@ -123,6 +123,7 @@ def assess(
 def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
     gram, rounding = regression.gram_with_rounding(at)
+    rounding = rounding + regression.rounding_of(gram)
     return knowledge(gram, *_beside(regression, at, tol), rounding)
 
 
@@ -138,6 +139,7 @@ def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float |
     """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
     def seen(at: Array, matrices: Array, rounding: Array) -> tuple[Array, Array]:
         """How well all are told apart, or λ_min over ρ, and what of that may be rounding."""
+        rounding = rounding + regression.rounding_of(matrices)
         if rho is not None:
             level = rounding.max(axis=1, initial=_TINY)
             return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho

@@ -14,9 +14,9 @@ from gpebo_cli.numerics.linalg import largest_over_time, transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 
-_TOLERANCE = 1e-12
+TOLERANCE = 1e-12
 _MAX_ELEMENTS = 200_000
-_LEVELS, _BESIDE_TIES = 24, 0.1234  # of ρ, a decade; none of them is at a round number
+_LEVELS, _BESIDE_TIES = 96, 0.1234  # of ρ, a decade; none of them is at a round number
 _SHORT = 0.01  # of a decay's own time
 _HALVES = 60  # of the time from one point to the next, in which ρ rises
 
@@ -71,7 +71,7 @@ def filtered(
 def _forgetting(turn: Trajectory) -> tuple[Array, Array]:
     """Times (k,) at which ρ rises, and what it is before, between and after them (k + 1,).
 
-    ρ/2 is the next of 24 rates a decade above the fastest decay of 𝔸 (p, p), in ``turn`` beside 𝕓,
+    ρ/2 is the next of 96 rates a decade above the fastest decay of 𝔸 (p, p), in ``turn`` beside 𝕓,
     at any time so far. A decay that has gone on for less than 0.01 of its own time does not count.
     """
     p, start = turn.values.shape[2], turn.mesh.span[0]
@@ -118,7 +118,7 @@ def _over(
         of_omega, start[:, :p].reshape(-1, 1), name="filter of the regressor",
         floor=sizes[:, :p].reshape(-1, 1),
     )
-    omega = solve(problem, mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
+    omega = solve(problem, mesh, tol=TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
 
     def of_rhs(t: Array, inside: Array) -> LinearEquation:
         sampled = omega(t, inside)[..., 0].reshape(-1, p, p)
@@ -130,7 +130,7 @@ def _over(
     problem = LinearProblem(
         of_rhs, start[:, p:], name="filter of the regression", floor=sizes[:, p:]
     )
-    rhs = solve(problem, omega.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
+    rhs = solve(problem, omega.mesh, tol=TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
     t, inside = rhs.mesh.points.ravel(), rhs.mesh.inside.ravel()
     both = np.concatenate(
         [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2

@@ -14,7 +14,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered
 from gpebo_cli.regression.parametrisation import Parametrisation
 from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
 
@@ -157,6 +157,17 @@ class LinearRegression:
                 share = (t[some] - mesh.edges[k]) / mesh.steps[k]
                 rounding[some] = interpolation_error(part, k, share)
         return found, rounding
+
+    def rounding_of(self, gram: Array) -> Array:
+        """What of the diagonal of G (M, p, p + c) filters of moving parameters leave, (M, p).
+
+        They are good to a share of the largest entry, in units in which parameters are comparable.
+        """
+        if self.dynamics is None:
+            return np.zeros(gram.shape[:2])
+        squares = self.dynamics.units**2
+        energy = np.einsum("mjj->mj", gram[..., : self.p]) * squares
+        return np.asarray(TOLERANCE * energy.max(axis=1, initial=0.0)[:, None] / squares)
 
     @cached_property
     def root(self) -> Array:
