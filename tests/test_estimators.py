@@ -888,3 +888,10 @@ def test_where_there_is_nothing_to_estimate_nothing_is_needed():
     found = _segments.estimate(Drem(gamma=[1.0, 2.0]), regression, T)
     assert found.requirement.holds
     assert found.parameters(slice(None)).shape == (2, len(T), 0)
+
+
+def test_an_estimator_that_is_not_resolved_names_what_would_help(monkeypatch):
+    """It advised to raise solver.max_elements, which has nothing to do with it."""
+    monkeypatch.setattr("gpebo_cli.estimators._vector._MAX_ELEMENTS", 2)
+    with pytest.raises(SolverError, match="lower its gain, or use estimator=least_squares"):
+        gpebo_cli.run("circuit", estimator="gradient", gamma=1e4)

@@ -91,7 +91,10 @@ class VectorLaw:
 
         wide = np.broadcast_to(start.reshape(p, -1), (p, c))
         starts = _with_residual(packed.values[0, 0], wide) if residual else wide
-        problem = LinearProblem(coefficients, starts, name="estimator", floor=sizes)
+        problem = LinearProblem(
+            coefficients, starts, name="estimator", floor=sizes,
+            advice="lower its gain, or use estimator=least_squares",
+        )
         return solve(
             problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
             restarts=_residual_restarts(packed, p) if residual else {},

@@ -75,8 +75,8 @@ class Exciting(WindowedEstimator):
         # The first column is of Φ; e − Φ (η, 0) and z start at 0.
         start = known[0].turned if known else np.outer([1.0, 0.0], np.eye(columns)[0])
         found = solve(
-            LinearProblem(rotation, start, name="new regressor"), path.mesh,
-            tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
+            LinearProblem(rotation, start, name="new regressor", advice="use estimator=drem"),
+            path.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
         ).trajectory
 
         def digits(delta: Array) -> Array:

@@ -97,7 +97,7 @@ def solve(
 
     mesh, (maps, values, whole), tail = refine(
         evaluate, mesh, tol=tol, max_elements=max_elements, name=problem.name,
-        fixed=restarts or (),
+        fixed=restarts or (), advice=problem.advice,
     )
     if whole < mesh.size:
         raise _not_finite(problem, mesh, maps, values, float(mesh.edges[whole]))

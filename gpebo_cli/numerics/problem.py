@@ -66,3 +66,4 @@ class LinearProblem:
     units: Array | None = None  # (n, 1)
     uncertain: Array | None = None  # (n, columns) errors of the start beside rounding
     told: bool = False  # whether the monitor has all components among its signals
+    advice: str = "raise solver.max_elements or solver.tol"  # where elements do not suffice

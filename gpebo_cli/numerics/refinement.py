@@ -12,6 +12,7 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
+from gpebo_cli.numerics.problem import LinearProblem
 
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _ROUNDING = 1e-6  # a tail below may be rounding, which cutting does not make smaller
@@ -38,7 +39,7 @@ class RoundingError(SolverError):
 
 def refine(
     evaluate: Evaluate[Found], mesh: Mesh, *, tol: float, max_elements: int, name: str,
-    patience: int = 1, fixed: Iterable[float] = (),
+    patience: int = 1, fixed: Iterable[float] = (), advice: str = LinearProblem.advice,
 ) -> tuple[Mesh, Found, Array]:
     """Cut the elements of ``mesh`` until the tail of each one is at most ``tol``.
 
@@ -90,7 +91,7 @@ def refine(
                         "solver.tol above that, or equations that lose fewer digits", there,
                     )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
-        _check_budget(mesh, tail, parts, max_elements, name)
+        _check_budget(mesh, tail, parts, max_elements, name, advice)
         before, cut = (np.broadcast_to(x, len(tail)).repeat(parts) for x in (floor, tail))
         missed = missed.repeat(parts)
         mesh, kept = mesh.split(parts)
@@ -125,7 +126,7 @@ def wanted_parts(tail: Array, poor: BoolArray, tol: float, stages: int) -> IntAr
 
 
 def _check_budget(
-    mesh: Mesh, tail: Array, parts: IntArray, max_elements: int, name: str
+    mesh: Mesh, tail: Array, parts: IntArray, max_elements: int, name: str, advice: str
 ) -> None:
     # Next to t = 0 floating point resolves any transient; elsewhere 64 units in the last place.
     cut = (parts > 1).nonzero()[0]
@@ -135,7 +136,7 @@ def _check_budget(
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {name} is not resolved with {max_elements} elements; worst near "
-            f"t = {t:.6g} (tail {tail[worst]:.1e}); raise solver.max_elements or solver.tol"
+            f"t = {t:.6g} (tail {tail[worst]:.1e}); {advice}"
         )
     if short:
         far = abs(mesh.edges[0]) > mesh.edges[-1] - mesh.edges[0]
