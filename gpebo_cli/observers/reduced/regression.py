@@ -47,7 +47,7 @@ class Assembled:
         gain None comes, with the units (k, p) that z without ξ_a is to be measured in. What
         ``rounding`` (n, n) of w leaves of a state is no signal to resolve.
         """
-        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+        columns = self._columns
         rows, Y, psi = self._rows, self.Y, self.psi
         if len(rows) < Y.shape[1]:
             Y, psi = Y[:, rows], psi[:, rows]
@@ -79,14 +79,17 @@ class Assembled:
         yield (psi**2).sum(axis=1), 1e-3
         yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
 
+    @property
+    def _columns(self) -> Array:
+        """Sizes of the columns of ψ (p,), 1 for those that vanish."""
+        return np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+
     def _through(self, rounding: Array) -> Array:
-        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
-        return np.asarray((rounding @ (self.moving / columns)).max(axis=1, initial=0.0))
+        return np.asarray((rounding @ (self.moving / self._columns)).max(axis=1, initial=0.0))
 
     def lost(self, rounding: Array) -> float:
         """Share of a state's size that ``rounding`` (n, n) of w is, at most."""
-        columns = np.where(self.column_scale > 0.0, self.column_scale, 1.0)
-        own = (largest_over_time(self.gain) / columns).max(axis=1, initial=0.0)
+        own = (largest_over_time(self.gain) / self._columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:
             own = np.maximum(own, largest_over_time(self.offset) / self.Y_scale)
         return float((self._through(rounding) / np.where(own > 0.0, own, np.inf)).max(initial=0.0))

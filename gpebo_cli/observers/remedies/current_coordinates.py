@@ -100,7 +100,7 @@ class CurrentCoordinates:
                 psi=mesh.trajectory(final.psi[:, kept]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
                 scale=final.column_scale,
-                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), q, units),
+                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), units),
             ),
             state_map=AffineStateMap(
                 mesh.trajectory(final.offset), mesh.trajectory(final.gain),
