@@ -49,8 +49,6 @@ _KEYS = (
 )
 
 
-_Truth = Literal["true", "false"]
-
 
 @dataclass(frozen=True)
 class Arguments:
@@ -118,7 +116,9 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
     overrides = [_stored(w) for w in given.words if w.partition("=")[0] not in _SWEEP_WORDS]
     config_dir, fail_fast = given.config_dir, sweep.get("fail_fast")
     config_name = _config_name(given.values.get("--config-name"), config_dir)
-    overrides = _with_data(overrides, config_name)
+    recorded = any(re.match(r"data\.file=(?!null$)", word) for word in overrides)
+    if recorded and config_name == PRIMARY and not any(w.startswith("data=") for w in overrides):
+        overrides.insert(0, "data=csv")  # a file says that there is a recording
     multirun = "--multirun" in given.switches
     return Arguments(
         given,
@@ -126,7 +126,9 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
         config_dir,
         config_name,
         _resume(sweep.get("resume")),
-        "" if fail_fast is None else convert(fail_fast.lower(), _Truth, "fail_fast"),
+        "" if fail_fast is None else convert(
+            fail_fast.lower(), Literal["true", "false"], "fail_fast"
+        ),
     )
 
 
@@ -153,13 +155,6 @@ def _stored(word: str) -> str:
         raise unknown(f"figures.{match[1]}: no such key", match[1], LOOK, "figures has")
     return word.replace("figures.", "output.", 1)
 
-
-def _with_data(overrides: list[str], config_name: str) -> list[str]:
-    """``data.file=FILE`` says that there is a recording: no need to write ``data=csv``, too."""
-    given = any(word.startswith("data.file=") and word != "data.file=null" for word in overrides)
-    chosen = any(word.startswith("data=") for word in overrides)
-    missing = given and not chosen and config_name == PRIMARY
-    return ["data=csv", *overrides] if missing else overrides
 
 
 def _with_regression(overrides: list[str]) -> tuple[str, ...]:
@@ -197,16 +192,13 @@ def _override(word: str, *, multirun: bool) -> str:
     if key.lstrip("+") == "hydra/sweeper" and equals:
         raise ConfigError(f"{word}: gpebo has a sweeper of its own; leave this away")
     if key.lstrip("+") in GROUPS and value.startswith("["):
-        names = ",".join(name.strip() for name in value.strip("[]").split(","))
-        raise ConfigError(f"{word}: one {key} for a run; for a run for each: -m {key}={names}")
+        swept = ",".join(name.strip() for name in value.strip("[]").split(","))
+        raise ConfigError(f"{word}: one {key} for a run; for a run for each: -m {key}={swept}")
     if key.lstrip("+") in GROUPS and equals and (multirun or "," not in value):
-        return f"{key}={_names(value)}"
+        # Names of files that Hydra would read as numbers or truth (``plant=2024``) are quoted.
+        names = [quoted(n) if _NOT_TEXT.fullmatch(n) else n for n in value.split(",")]
+        return f"{key}={','.join(names)}"
     return word
-
-
-def _names(chosen: str) -> str:
-    """Names of files that Hydra would read as numbers or truth (``plant=2024``), quoted."""
-    return ",".join(quoted(n) if _NOT_TEXT.fullmatch(n) else n for n in chosen.split(","))
 
 
 def _resume(given: str | None) -> str | None:

@@ -29,7 +29,7 @@ from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results import sweep_folder
-from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.files import csv_text, make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
 from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.results.sweep_folder import STOP, TABLE, JobRecord, Plan
@@ -127,7 +127,7 @@ def run_sweep(
             replace(r, error=errors.get(r.job, "no result")) if r.status == "missing" else r
             for r in sweep_folder.read_records(folder, plan)
         ]
-        sweep_folder.write_table(folder, records)
+        write_text(folder / TABLE, csv_text(sweep_folder.table(records)))
         if not orders.quiet:
             _print_table(records, folder, rows=finished)
     _raise_failures(records, folder, trouble, stopped=(folder / STOP).exists())

@@ -52,11 +52,6 @@ class NoiseLevels:
         """Which inputs are measured wrongly, shape (m,)."""
         return self.inputs > 0
 
-    @property
-    def noisy_outputs(self) -> BoolArray:
-        """Which outputs are, shape (r,)."""
-        return (self.outputs > 0) | (self.steps > 0)
-
     @cached_property
     def silent(self) -> bool:
         """Whether what is measured is what is there."""

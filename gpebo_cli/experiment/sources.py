@@ -70,11 +70,12 @@ def simulated(
     measured = measure(simulation.signals, settings.noise, levels)
     simulated = _sample_simulation(system, simulation, t)
     if not levels.silent:
+        # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
+        noisy = (levels.outputs > 0) | (levels.steps > 0)
         simulated = replace(
             simulated,
-            # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
             measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
-            measured_outputs=np.where(levels.noisy_outputs, measured.outputs(t), simulated.outputs),
+            measured_outputs=np.where(noisy, measured.outputs(t), simulated.outputs),
         )
     if simulated.impulses and settings.observer["name"] != "none":
         when, state = simulated.impulses[0]
@@ -173,8 +174,7 @@ def _grid(settings: Settings, samples: Sampling | None, start: float, stop: floa
     if samples is None:
         return np.linspace(start, stop, settings.time.samples)
     t = sample_times(samples.step, start, stop)
-    kept: Array = t[kept_samples(1, len(t), settings.time.samples)]
-    return kept
+    return np.asarray(t[kept_samples(1, len(t), settings.time.samples)])
 
 
 def sample_times(step: float, start: float, stop: float) -> Array:

@@ -116,8 +116,7 @@ def simulation_verdict(simulated: SimulationResult) -> str:
     return (
         f"simulated: index {simulated.index}, {simulated.differential} differential and "
         f"{simulated.algebraic} algebraic equations, error estimate "
-        f"{simulated.error_estimate:.1e} of each state's size{newton_note(simulated)}"
-        f"{_vague_note(simulated)}"
+        f"{simulated.error_estimate:.1e} of each state's size{_cost_and_loss(simulated)}"
     )
 
 
@@ -125,7 +124,7 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     """What the last line of a run has to say of the simulation, from "; " on."""
     if simulated is None:
         return ""
-    told = newton_note(simulated) + _vague_note(simulated)
+    told = _cost_and_loss(simulated)
     if simulated.error_estimate > _AMPLIFIED * tol:
         told += (
             "; the simulation is not as good as solver.tol, only to "
@@ -134,13 +133,17 @@ def simulation_note(simulated: SimulationResult | None, tol: float) -> str:
     return told
 
 
-def _vague_note(simulated: SimulationResult) -> str:
-    if not simulated.vague:
-        return ""
-    return (
-        f"; less than three digits are known of {', '.join(simulated.vague)} "
-        "(error_estimate.by_state in summary.json)"
-    )
+def _cost_and_loss(simulated: SimulationResult) -> str:
+    """What the simulation of a nonlinear plant cost, and states that lost digits, from "; " on."""
+    solves, told = simulated.linear_solves, ""
+    if solves is not None:
+        told = f"; Newton's method cost {solves:.2g} linear solves"
+    if simulated.vague:
+        told += (
+            f"; less than three digits are known of {', '.join(simulated.vague)} "
+            "(error_estimate.by_state in summary.json)"
+        )
+    return told
 
 
 def rows_note(left_out: int, filled: int, policy: str) -> str:
@@ -183,11 +186,6 @@ def functions_note(
         return ""
     return f"; nothing bounds what {which} do between the times at which they are evaluated"
 
-
-def newton_note(simulated: SimulationResult) -> str:
-    """What the simulation of a nonlinear plant cost, from "; " on."""
-    solves = simulated.linear_solves
-    return "" if solves is None else f"; Newton's method cost {solves:.2g} linear solves"
 
 
 def _best_case(metrics: Metrics) -> int | None:

@@ -86,8 +86,10 @@ def examine(netlist: Netlist, file: str) -> Topology:
         """Nodes that are connected by elements of other kinds than ``without``."""
         sets = DisjointSet(nodes)
         for e in branches:
-            for pair in () if e.kind in without else _branches_of(e):
-                sets.merge(*pair)
+            if e.kind not in without:
+                sets.merge(*e.nodes[:2])
+                if e.kind == "T":  # both sides of a transformer carry a current
+                    sets.merge(*e.nodes[2:])
         return sets
 
     connected = joined("")
@@ -125,12 +127,6 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     parts = re.findall(r"\d+|\D+", name.lower())
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
-
-def _branches_of(e: Element) -> list[tuple[str, str]]:
-    """Pairs of nodes between which an element carries a current."""
-    if e.kind == "T":
-        return [(e.nodes[0], e.nodes[1]), (e.nodes[2], e.nodes[3])]
-    return [(e.nodes[0], e.nodes[1])]
 
 
 def _loops(branches: Sequence[Element]) -> Iterable[tuple[str, ...]]:

@@ -216,8 +216,7 @@ class TextCoefficients:
 
     def truth(self, t: Array) -> Array:
         """True values of the unknowns at the times ``t`` (N,), shape (N, q)."""
-        values: Array = self.unknowns.taylor(t, 0)[0]
-        return values
+        return np.asarray(self.unknowns.taylor(t, 0)[0])
 
     def breakpoints(self, start: float, stop: float) -> Array:
         """Times strictly between ``start`` and ``stop``, sorted, of jumps and kinks.
@@ -338,10 +337,11 @@ def coefficients_of(
     Inputs stand for their names in ``entries``, outputs have values only along signals.
     """
     restricted = None
-    if any(
-        not e.node.signals.isdisjoint(outputs)
-        for _, given in entries.values() for e in given.values()
-    ):
+    signals = {
+        key: frozenset[str]().union(*(e.node.signals for e in given.values()))
+        for key, (_, given) in entries.items()
+    }
+    if not all(map(outputs.isdisjoint, signals.values())):
         kept = {
             key: (shape, {k: e for k, e in given.items() if e.node.signals.isdisjoint(outputs)})
             for key, (shape, given) in entries.items()
@@ -360,10 +360,6 @@ def coefficients_of(
         record(varying, inputs), np.array(targets, dtype=np.intp).reshape(-1, 2),
         tuple(fixed[name] for name in MATRIX_NAMES),
     )
-    signals = {
-        key: frozenset[str]().union(*(e.node.signals for e in given.values()))
-        for key, (_, given) in entries.items()
-    }
     depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
     truth = record(list(entries["theta"][1].values()))
     divisors = tuple(

@@ -129,7 +129,6 @@ class StateMap(Protocol):
 
     def at(self, t: Array) -> Reconstruction:
         """The map at the times t (M,), ascending, ``times`` among them."""
-        ...
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:  # noqa: ARG002
         """The same states by another way, by column name (g, M) each, from x̂ (g, M, n)."""
@@ -142,7 +141,6 @@ class Differentiable(StateMap, Protocol):
 
     def gains(self, t: Array, states: Array) -> Array:
         """∂x̂/∂η̂ at the times t (M,), where the estimates are x̂ (g, M, n): (g, M, n, p)."""
-        ...
 
 
 @runtime_checkable
@@ -151,7 +149,6 @@ class Filtering(StateMap, Protocol):
 
     def deviations(self, t: Array) -> tuple[Array, Array]:
         """Standard deviations at the times t (M,) of what is estimated (M, p) and of x̂ (M, n)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +187,6 @@ class Truth(Protocol):
 
     def __call__(self, t: Array, theta: Array, states: Trajectory) -> Array:
         """η at the times t (M,), shape (M, p), from θ there (M, q) and the states (n,)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +317,6 @@ class Observer(Protocol):
             ConfigError: settings that do not fit the plant.
             SolverError: the tolerance cannot be reached.
         """
-        ...
 
 
 class Sampling(NamedTuple):
@@ -337,17 +332,14 @@ class Reached(Protocol):
     @property
     def t(self) -> float:
         """The time of that sample."""
-        ...
 
     @property
     def growth(self) -> float | None:
         """Largest entry of Φ so far; None where there is no Φ."""
-        ...
 
     @property
     def error_estimate(self) -> float:
         """Error estimate of what is integrated between samples, so far."""
-        ...
 
 
 class Recursion(Protocol):
@@ -356,21 +348,17 @@ class Recursion(Protocol):
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the regression's parameters, p of them."""
-        ...
 
     def advance(
         self, state: Any, t: Array, u: Array, y: Array
     ) -> tuple[Reached, SampledBlock]:
         """Carry ``state`` (None before the first sample) over u (K, m), y (K, r) at t (K,)."""
-        ...
 
     def assumptions(self, reached: Any) -> tuple[Assumption, ...]:
         """What was needed so far, with its evidence."""
-        ...
 
     def truth(self, extension: Array) -> Truth:
         """What the parameters are, from [ξ_a | ξ_b | Φ] (K, k, 1 + p) at the times to be asked."""
-        ...
 
 
 @runtime_checkable
@@ -379,7 +367,6 @@ class Responding(Recursion, Protocol):
 
     def responding(self, noisy: BoolArray) -> Recursion:
         """The same with ``errors`` where those of the noisy ones of [u; y] (m + r,) are linear."""
-        ...
 
 
 @runtime_checkable
@@ -388,7 +375,6 @@ class AtSamples(Observer, Protocol):
 
     def sampling(self) -> Sampling | None:
         """The samples at which it was asked to run; None if it runs in continuous time."""
-        ...
 
     def at_samples(
         self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
@@ -398,7 +384,6 @@ class AtSamples(Observer, Protocol):
 
         ``derivatives`` of the inputs are for constraints that contain them; None: nobody knows any.
         """
-        ...
 
 
 def initial_extension(

@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, signal_scale
@@ -95,11 +95,6 @@ def pair(P: Array, estimate: Array) -> Array:
     out[n:, :n], out[n:, n:] = P, estimate
     return out
 
-
-def _to_cut(lost: BoolArray, points: int) -> Kind:
-    """A signal that is not resolved where elements (K,) of so many points lose conditioning."""
-    alternating = np.resize([1.0, -1.0], points)[:, None]
-    return np.where(lost[:, None, None], alternating, 0.0), 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +187,10 @@ def run_filter(
         found = [(own.reshape(*own.shape[:2], -1), 0.0), *followed(estimate, extras)]
         n = P.shape[-1]
         grown = np.abs(values[..., :n, :n]).max(axis=(1, 2, 3), initial=0.0)
-        lost = grown > _GROWTH
-        return [_to_cut(lost, P.shape[1]), *found] if lost.any() else found
+        if (lost := grown > _GROWTH).any():  # no signal is resolved where conditioning is lost
+            alternating = np.resize([1.0, -1.0], P.shape[1])[:, None]
+            found.insert(0, (np.where(lost[:, None, None], alternating, 0.0), 0.0))
+        return found
 
     problem = LinearProblem(
         coefficients, first, signals, name,

@@ -199,8 +199,7 @@ class EquationForm:
         They follow no signal; any at which the other matrices have values will do.
         """
         along = None if signals is None else signals[None]
-        found: Array = self.system.coefficients.taylor(t, order, inside, along).E[order]
-        return found
+        return np.asarray(self.system.coefficients.taylor(t, order, inside, along).E[order])
 
     def along(
         self, t: Array, inside: Array, signals: Array | None, order: int

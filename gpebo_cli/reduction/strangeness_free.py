@@ -196,8 +196,8 @@ def direct_part(c: Coefficients, zero: frozenset[str]) -> Array:
     """D u + H θ at N times, (N, r), or at one where both vanish: what no state has part in."""
     if {"D", "H"} <= zero:
         return np.zeros((1, c.C.shape[2]))
-    found: Array = taylor_product(c.D[:1], c.u[:1])[0] + taylor_product(c.H[:1], c.theta[:1])[0]
-    return found
+    of_input, of_unknowns = taylor_product(c.D[:1], c.u[:1]), taylor_product(c.H[:1], c.theta[:1])
+    return np.asarray(of_input[0] + of_unknowns[0])
 
 
 def _by_singular_vectors(

@@ -29,16 +29,13 @@ class Estimates(Protocol):
 
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,), shape (1 or cases, M), or None where nothing is mixed."""
-        ...
 
     @property
     def requirement(self) -> Requirement:
         """What the estimator needs of the regressor, and what it got."""
-        ...
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases at the times, shape (g, M, p), or (g, M, p, c) as Y has it."""
-        ...
 
 
 class Unmixed:
@@ -72,7 +69,6 @@ class Estimator(Protocol):
     @property
     def cases(self) -> tuple[Mapping[str, float], ...]:
         """Every combination of gains, by name."""
-        ...
 
     def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
         """Prepare the estimates at the times t (M,), ascending.
@@ -80,7 +76,6 @@ class Estimator(Protocol):
         Raises:
             ConfigError: a setting's length does not match the parameters.
         """
-        ...
 
 
 class ResumableEstimates(Estimates, Protocol):
@@ -89,11 +84,9 @@ class ResumableEstimates(Estimates, Protocol):
     @property
     def reached(self) -> tuple[ExtensionState, ...]:
         """The extensions at the end of the regression: what ``resume`` takes as ``known``."""
-        ...
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases (g, M, p) at the times, from ``start`` (g, p); None: the settings'."""
-        ...
 
 
 class WindowEstimates(ResumableEstimates, Protocol):
@@ -101,7 +94,6 @@ class WindowEstimates(ResumableEstimates, Protocol):
 
     def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
         """What is needed and was got in all of the ``parts`` of a span, this the first of them."""
-        ...
 
 
 class Lasting:
@@ -118,7 +110,6 @@ class Weighing(Protocol):
 
     def weights(self, case: int) -> Array:
         """M (M, p, p) of (η − η̂)ᵀ M (η − η̂), by which the sum grows beside η̂, at the times."""
-        ...
 
 
 @runtime_checkable
@@ -130,7 +121,6 @@ class Windowed(Estimator, Protocol):
 
         From what was ``reached`` in the window before; none: it is the first one.
         """
-        ...
 
 
 @runtime_checkable
@@ -142,7 +132,6 @@ class Resumable(Protocol):
 
         From extensions that are known at its start; none: they start at zero.
         """
-        ...
 
 
 @runtime_checkable
@@ -153,7 +142,6 @@ class Moving(Protocol):
         self, regression: LinearRegression, dynamics: Dynamics, t: Array
     ) -> Estimates:
         """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
-        ...
 
 
 @runtime_checkable
@@ -162,7 +150,6 @@ class Fitting(Protocol):
 
     def law(self, S: Parametrisation | None) -> object:
         """What it makes of S (ConfigError: there is none, or one that it cannot take)."""
-        ...
 
 
 @runtime_checkable
@@ -174,7 +161,6 @@ class Affine(Protocol):
 
         One that is ``Windowed`` takes what was ``known`` before as a second argument.
         """
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +180,10 @@ class Recursion(Protocol):
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        ...
 
     @property
     def requirement(self) -> Requirement:
         """What the estimator needs of the regressor, and what it got so far."""
-        ...
 
 
 @runtime_checkable
@@ -212,4 +196,3 @@ class Recursive(Protocol):
         Raises:
             ConfigError: a setting that there is in continuous time only.
         """
-        ...

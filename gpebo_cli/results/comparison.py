@@ -154,12 +154,9 @@ def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:
             order = np.argsort(x, kind="stable")
             curves.append(Curve(x[order], y[order], label, replace(line(k), dots=True)))
         if any(np.isfinite(c.y).any() and np.nanmax(c.y) > 0 for c in curves):
-            first = not panels
+            legend = not panels and len(curves) > 1
             panels.append(
-                Panel(
-                    _label(metric), tuple(curves), log=True, axis=axis,
-                    legend=first and len(curves) > 1,
-                )
+                Panel(_label(metric), tuple(curves), log=True, axis=axis, legend=legend)
             )
     return panels
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _PNG = b"\x89PNG\r\n\x1a\n"
 _LARGEST = 20_000_000  # bytes of a picture
 _MOST_CASES = 50
+# Sections of the summary that are a few numbers each.
+_SECTIONS = ("recording", "noise", "fit", "excitation", "error_estimate", "timings")
 
 
 def document(parts: Sequence[Found], made_by: Provenance) -> str:
@@ -65,7 +67,8 @@ def _run(name: str, folder: Path) -> str:
     try:
         words = _words(summary)
         assumptions = _assumptions(summary)
-        facts = _facts(summary)
+        facts = [("", ""), *((key.replace("_", " "), text) for key in _SECTIONS
+                             if (text := _pairs(summary.get(key))))]
         made_with = _pairs(summary.get("versions")), _pairs(summary.get("git"))
         estimates, cases = _estimates(summary), _cases(folder)
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -78,7 +81,9 @@ def _run(name: str, folder: Path) -> str:
     versions, configuration = "; ".join(filter(None, made_with)), ""
     if (path := folder / "config.yaml").is_file():
         written = path.read_text(encoding="utf-8", errors="replace")
-        configuration = html.folded("Configuration", written)
+        configuration = (
+            f"<details><summary>Configuration</summary>\n<pre>{escape(written)}</pre></details>\n"
+        )
     return (
         f"<section>\n<h2>{escape(name)}</h2>\n{words}"
         f"{_titled('Estimates at the end', html.table(estimates))}"
@@ -118,12 +123,6 @@ def _assumptions(summary: Mapping[str, Any]) -> str:
     failed = [number for number, a in enumerate(found) if not a["holds"]]
     return html.table(rows, text=True, failed=failed) if found else ""
 
-
-def _facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """The sections of the summary that are a few numbers each."""
-    keys = ("recording", "noise", "fit", "excitation", "error_estimate", "timings")
-    rows = [(key.replace("_", " "), _pairs(summary.get(key))) for key in keys]
-    return [("", ""), *(row for row in rows if row[1])]
 
 
 def _pairs(section: object) -> str:

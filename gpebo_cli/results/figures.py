@@ -82,9 +82,11 @@ def _of_estimates(
     @wraps(figure)
     def of_run(result: RunResult) -> list[Panel]:
         estimation = result.estimation
-        return [] if estimation is None else _with_legend(
-            figure(result, estimation), _note(estimation)
-        )
+        if estimation is None:
+            return []
+        count = len(estimation.cases)
+        note = f"{MAX_CASES} of {count} cases:" if count > MAX_CASES else ""
+        return _with_legend(figure(result, estimation), note)
 
     return of_run
 
@@ -362,8 +364,7 @@ def truth_at(result: RunResult, t: Array) -> Array:
         return signals.states
     # The middle between two neighbours: rounding of a time does not choose another row.
     nearest = np.searchsorted(0.5 * (signals.t[1:] + signals.t[:-1]), t)
-    states: Array = signals.states[nearest]
-    return states
+    return np.asarray(signals.states[nearest])
 
 
 def _known(result: RunResult) -> list[int]:
@@ -376,10 +377,6 @@ def _shown_cases(estimation: EstimationResult) -> list[int]:
     count = len(estimation.cases)
     return [int(case) for case in np.linspace(0, count - 1, min(count, MAX_CASES)).round()]
 
-
-def _note(estimation: EstimationResult) -> str:
-    count = len(estimation.cases)
-    return f"{MAX_CASES} of {count} cases:" if count > MAX_CASES else ""
 
 
 def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:

@@ -55,10 +55,6 @@ def paragraph(text: str, kind: str = "") -> str:
     return f"<p{f' class={kind}' if kind else ''}>{escape(text)}</p>\n" if text else ""
 
 
-def folded(title: str, text: str) -> str:
-    """Text as it stands, behind its title until somebody opens it."""
-    return f"<details><summary>{escape(title)}</summary>\n<pre>{escape(text)}</pre></details>\n"
-
 
 def embedded_figure(png: bytes, name: str) -> str:
     """A picture in the page itself; a click shows it as large as the page."""

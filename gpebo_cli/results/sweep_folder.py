@@ -18,7 +18,7 @@ from typing import Literal
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import open_regular, strict_json
-from gpebo_cli.results.files import cell, csv_text, remove_files, write_text
+from gpebo_cli.results.files import cell, remove_files, write_text
 from gpebo_cli.schema import read
 
 PLAN = "sweep.json"
@@ -111,10 +111,6 @@ def clear(folder: Path, numbers: Sequence[int]) -> None:
         inside = job_folder(folder, number)
         remove_files([inside / RESULT, *inside.glob(".*.tmp")])
 
-
-def write_table(folder: Path, records: Sequence[JobRecord]) -> None:
-    """Write ``results.csv``."""
-    write_text(folder / TABLE, csv_text(table(records)))
 
 
 def table(records: Sequence[JobRecord]) -> list[list[str]]:

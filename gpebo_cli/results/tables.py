@@ -104,7 +104,9 @@ def _estimates(result: RunResult) -> Table | None:
         if suffix == "hat" and delta is not None:
             kinds.append((["delta"], delta[..., None]))
     kinds += [([name], check[..., None]) for name, check in e.checks.items()]
-    kinds += [([f"{name}_true"], truth[None, :, None]) for name, truth in _varying_truth(e)]
+    for name, truth in zip(e.names, e.true_parameters.T, strict=True):
+        if not np.isnan(truth).any() and np.ptp(truth) > 0.0:
+            kinds.append(([f"{name}_true"], truth[None, :, None]))
     cases, at_once = len(e.cases), max(1, _CHUNK_ROWS // max(len(e.t), 1))
 
     def rows(part: slice) -> Array:
@@ -190,15 +192,6 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
             )
     write_text(path, csv_text(rows))
 
-
-def _varying_truth(estimation: EstimationResult) -> list[tuple[str, Array]]:
-    """What is estimated and is not the same at all times, with its true values (M,)."""
-    truth = estimation.true_parameters
-    return [
-        (name, truth[:, i])
-        for i, name in enumerate(estimation.names)
-        if not np.isnan(truth[:, i]).any() and np.any(truth[:, i] != truth[:1, i])
-    ]
 
 
 def rows_text(table: Array, first: str = "%.17g") -> Iterator[bytes]:

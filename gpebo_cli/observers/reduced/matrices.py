@@ -237,9 +237,12 @@ def _by_steps(
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
-    arguments = system, algebraic, split.kernel, units.states, t, rank_tol
+    own = split.kernel / units.states[:, None]
+    kernel = split.kernel / np.linalg.norm(own, axis=1, keepdims=True)
+    size = np.maximum(np.linalg.norm(algebraic * units.states, axis=(1, 2)), TINY)
+    arguments = system, algebraic @ kernel, kernel, size, t, rank_tol
     if frame is not None and frame.remaining is not None:
-        Q1, K, injectivity = _eliminate_in_part(*arguments, frame.remaining.rank)
+        Q1, K, injectivity = _eliminate_in_part(*arguments, units.states, frame.remaining.rank)
     else:
         Q1, K, injectivity = _eliminate(*arguments)
     rounding = None
@@ -329,18 +332,15 @@ def _seen_through(
 
 
 def _eliminate(
-    system: DescriptorSystem, algebraic: Array, kernel: Array, units: Array, t: Array,
+    system: DescriptorSystem, on_kernel: Array, kernel: Array, size: Array, t: Array,
     rank_tol: float,
 ) -> tuple[Array, Array, Array]:
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
-    σ_min(R1) ≥ 1/‖R1⁻¹‖_F; it is computed itself only where that bound leaves a doubt.
+    From 𝒜 V2 on a basis V2 of the kernel of E (N, n, n_b), and the size (N,) of 𝒜. σ_min(R1) ≥
+    1/‖R1⁻¹‖_F; it is computed itself only where that bound leaves a doubt.
     """
-    kernel = kernel / np.linalg.norm(kernel / units[:, None], axis=1, keepdims=True)
-    on_kernel = algebraic @ kernel
-    size = np.maximum(np.linalg.norm(algebraic * units, axis=(1, 2)), TINY)
-    n_b = kernel.shape[2]
-    if n_b == 0:
+    if kernel.shape[2] == 0:
         return on_kernel, kernel[:1], np.full(len(size), np.inf)
     Q1, R1 = np.linalg.qr(on_kernel)
     inverse = inverses(R1)
@@ -362,13 +362,11 @@ def _eliminate(
 
 
 def _eliminate_in_part(
-    system: DescriptorSystem, algebraic: Array, kernel: Array, units: Array, t: Array,
-    rank_tol: float, rank: int,
+    system: DescriptorSystem, on_kernel: Array, kernel: Array, size: Array, t: Array,
+    rank_tol: float, units: Array, rank: int,
 ) -> tuple[Array, Array, Array]:
     """:func:`_eliminate` by the pseudoinverse of a rank that has to be the same at all times."""
-    kernel = kernel / np.linalg.norm(kernel / units[:, None], axis=1, keepdims=True)
-    size = np.maximum(np.linalg.norm(algebraic * units, axis=(1, 2)), TINY)
-    U, sigma, Vt = np.linalg.svd(algebraic @ kernel)
+    U, sigma, Vt = np.linalg.svd(on_kernel)
     ranks = (sigma > rank_tol * size[:, None]).sum(axis=1)
     if (ranks != rank).any():
         raise NotObservableError(

@@ -117,8 +117,7 @@ class Assembled:
         """Rows of the residual that are more than rounding of their terms."""
         in_psi, in_Y = largest_over_time(self.psi), largest_over_time(self.Y)
         large = (in_psi > VANISHING * self.column_scale).any(axis=1)
-        kept: IntArray = (large | (in_Y > VANISHING * self.Y_scale)).nonzero()[0]
-        return kept
+        return np.flatnonzero(large | (in_Y > VANISHING * self.Y_scale))
 
 
 def regression_signals(

@@ -21,7 +21,6 @@ class Remedy(Protocol):
 
     def observe(self, reduced: ReducedSystem) -> Observation:
         """The regression and the state map of a reduced system on measured signals."""
-        ...
 
 
 REMEDIES = {
