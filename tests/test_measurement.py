@@ -220,6 +220,27 @@ def test_the_regression_of_noisy_signals(shape):
     assert ours == pytest.approx(expected, abs=1e-8)
 
 
+def test_a_stiff_gradient_takes_few_elements_where_y_bends_at_every_sample(monkeypatch):
+    """η̂' = −r (η̂ − Y/ψ) with r h = 500 in each of 200 rough samples, in closed form."""
+    monkeypatch.setattr("gpebo_cli.estimators._vector._MAX_ELEMENTS", 800)
+    mesh, psi = flat_mesh(np.linspace(0.0, 1.0, 201), stages=6), 100.0
+    rows, rate = 1.0 + 1e-5 * np.random.default_rng(0).standard_normal(201), 500.0 * 200
+    share = (mesh.points - mesh.edges[:-1, None]) / mesh.steps[:, None]
+    Y = rows[:-1, None] + share * np.diff(rows)[:, None]
+    regression = LinearRegression(
+        Trajectory(mesh, psi * Y[..., None]), Trajectory(mesh, np.full((*Y.shape, 1, 1), psi)),
+        ("a",), 1.0,
+    )
+    law = build({"name": "gradient", "gamma": rate / psi**2, "initial": [rows[0]]})
+    ours = law.estimate(regression, mesh.edges).parameters(slice(None))[0, :, 0]
+    eta, expected = rows[0], [rows[0]]
+    for row, slope in zip(rows, np.diff(rows) * 200, strict=False):
+        follows = row - slope / rate  # what η̂ does when all else has gone, at the start
+        eta = follows + slope / 200 + np.exp(-rate / 200) * (eta - follows)
+        expected.append(eta)
+    np.testing.assert_allclose(ours, expected, atol=1e-8)
+
+
 @pytest.mark.parametrize("name", ["gradient", "mre"])
 def test_vector_laws_follow_a_regression_that_jumps(name):
     """The residual of the law jumps with every sample; η̂ against a batch of matrix integrals."""

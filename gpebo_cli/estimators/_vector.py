@@ -24,6 +24,7 @@ from gpebo_cli.regression.resets import ExtensionState
 _LEFT = float(np.exp(-DECAY))  # of the initial error
 _MAX_ELEMENTS = 200_000
 _TOLERANCE = 1e-11
+_ANY = 1e200  # size of a signal that need not be resolved
 _ROUNDING = 1e-13  # smaller steps between elements are no jumps
 
 
@@ -52,10 +53,11 @@ class VectorLaw:
         b = with_realisations(self.N.values, self.b.values)
         signals = [self.N.values, b] if self.M is None else [self.M.values, self.N.values, b]
         first, eta, found = 0, start, list[Trajectory]()
-        # So far: later, η̂ and ν may have decayed.
+        # So far: later, η̂ may have decayed. Where Y bends, at each sample of a recording, ν has
+        # layers that are nothing in η̂, and alone they would take most of the elements.
         sizes = np.broadcast_to(self.floor, len(start))[:, None]
         if self.M is not None:
-            sizes = np.concatenate([sizes, np.abs(self.N.values).max(axis=(0, 1)) @ sizes])
+            sizes = np.append(sizes, np.full((b.shape[2], 1), _ANY), axis=0)
         for window in self.N.mesh.windows():
             part = slice(first, first + window.size)
             packed = np.concatenate([values[part] for values in signals], axis=-1)
