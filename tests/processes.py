@@ -98,6 +98,12 @@ def refused(
     assert [part for part in parts if part not in said] == [], said
 
 
+def printed(done: subprocess.CompletedProcess[str]) -> str:
+    """What a command printed that ended well, without a word on standard error."""
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
 def assert_refused(done: subprocess.CompletedProcess[str], *parts: str, code: int = 2) -> None:
     """A command has said one line with all these parts, and nothing else."""
     said = done.stderr

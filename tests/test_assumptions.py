@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from examples import gpebo
 from plants import shipped
+from processes import printed
 
 from gpebo_cli import run
 from gpebo_cli.experiment.assumptions import examine, warnings
@@ -114,9 +115,8 @@ def test_gpebo(words, code, last, tmp_path):
 
 
 def test_command_as_json(tmp_path):
-    done = gpebo("check", "plant=canonical", "observer=canonical", "--json", cwd=tmp_path)
-    assert done.returncode == 0
-    answer = json.loads(done.stdout)
+    said = printed(gpebo("check", "plant=canonical", "observer=canonical", "--json", cwd=tmp_path))
+    answer = json.loads(said)
     assert answer["holds"] is True
     assert {"name", "statement", "holds", "evidence"} == set(answer["assumptions"][0])
 

@@ -10,7 +10,7 @@ import tomllib
 import pytest
 import yaml
 from examples import ROOT, gpebo, shell
-from processes import assert_refused, install, process
+from processes import assert_refused, install, printed, process
 
 from gpebo_cli.cli.check import _ADVICE
 from gpebo_cli.cli.new import files
@@ -20,41 +20,32 @@ PYTEST = f"{shlex.quote(sys.executable)} -m pytest -q -W error -p no:xdist"
 
 
 def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):
-    done = gpebo("new", "plant", "tank", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    path, run, check = done.stdout.splitlines()
+    path, run, check = printed(gpebo("new", "plant", "tank", cwd=tmp_path)).splitlines()
     assert path == "plant/tank.yaml"
     words = run.partition("gpebo ")[2].split()
-    done = gpebo(*words, "figures=none", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "never" not in done.stdout
-    assert "not met" not in done.stdout
+    said = printed(gpebo(*words, "figures=none", cwd=tmp_path))
+    assert "never" not in said
+    assert "not met" not in said
     words = check.partition("gpebo ")[2].split()
-    done = gpebo(*words, cwd=tmp_path)
-    assert done.returncode == 0
-    assert done.stdout.endswith("everything that is needed holds\n")
+    assert printed(gpebo(*words, cwd=tmp_path)).endswith("everything that is needed holds\n")
     assert "heated tank" in gpebo("list", "plants", "--config-dir", ".", cwd=tmp_path).stdout
 
 
 def test_it_can_be_written_elsewhere(tmp_path):
-    done = gpebo("new", "plant", "tank.yaml", "--config-dir", "my models", cwd=tmp_path)
-    assert done.returncode == 0
+    said = printed(gpebo("new", "plant", "tank.yaml", "--config-dir", "my models", cwd=tmp_path))
     assert (tmp_path / "my models" / "plant" / "tank.yaml").is_file()
-    assert "--config-dir 'my models' plant=tank" in done.stdout
+    assert "--config-dir 'my models' plant=tank" in said
 
 
 def test_an_observer_passes_its_test(tmp_path):
-    done = gpebo("new", "observer", "mine_too", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    printed(gpebo("new", "observer", "mine_too", cwd=tmp_path))
     assert "3 passed" in shell(PYTEST, tmp_path)
     entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
     assert entry == {"gpebo.observers": {"mine_too": "mine_too:MineToo"}}
 
 
 def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path):
-    done = gpebo("new", "estimator", "two_words", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    written = done.stdout.splitlines()[:4]
+    written = printed(gpebo("new", "estimator", "two_words", cwd=tmp_path)).splitlines()[:4]
     assert written == [
         "two_words.py", "estimator/two_words.yaml", "test_two_words.py", "pyproject.toml",
     ]
@@ -67,9 +58,8 @@ def test_an_estimator_passes_its_test_and_is_found_once_it_is_installed(tmp_path
 
 
 def test_a_recipe_runs_and_is_drawn(tmp_path):
-    done = gpebo("new", "recipe", "two_gains", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "gpebo run --config-dir . experiment=two_gains" in done.stdout
+    said = printed(gpebo("new", "recipe", "two_gains", cwd=tmp_path))
+    assert "gpebo run --config-dir . experiment=two_gains" in said
     done = gpebo("run", "--config-dir", ".", "experiment=two_gains", "figures=none", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "1e+08" in done.stdout
@@ -77,8 +67,7 @@ def test_a_recipe_runs_and_is_drawn(tmp_path):
     assert "the circuit, fast and slow gains" in listed
     path = tmp_path / "experiment" / "two_gains.yaml"
     path.write_text(path.read_text().replace("horizon: 20, samples: 1001", "horizon: 2"))
-    done = gpebo("figures", "two_gains", "--config-dir", ".", "--output", "drawn", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    printed(gpebo("figures", "two_gains", "--config-dir", ".", "--output", "drawn", cwd=tmp_path))
     assert "fast and slow gains" in (tmp_path / "drawn" / "index.html").read_text()
     wrong = gpebo("figures", "two_gain", "--config-dir", ".", cwd=tmp_path)
     assert "did you mean two_gains?" in wrong.stderr

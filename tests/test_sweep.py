@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from plants import DECAYING
-from processes import assert_refused, begin, rows_of, wait_for
+from processes import assert_refused, begin, printed, rows_of, wait_for
 from processes import process as gpebo
 from scipy.integrate import trapezoid
 
@@ -44,8 +44,7 @@ def stamps(folder):
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole")
-    done = gpebo(*SWEEP, "hydra.sweep.dir=sweep", cwd=folder)
-    assert (done.returncode, done.stderr) == (0, "")
+    printed(gpebo(*SWEEP, "hydra.sweep.dir=sweep", cwd=folder))
     return folder / "sweep"
 
 
@@ -88,9 +87,7 @@ def test_quoted_text_is_read_back_by_hydra(text):
     (["run", "experiment=gain_multirun"], ["estimator", "estimator.gamma"], 10),  # of a recipe
 ])
 def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path, words, keys, count):
-    done = gpebo(*words, "--dry-run", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    head, *jobs, last = done.stdout.splitlines()
+    head, *jobs, last = printed(gpebo(*words, "--dry-run", cwd=tmp_path)).splitlines()
     assert head.split()[: 1 + len(keys)] == ["job", *keys]
     assert (len(jobs), last) == (count, f"{count} jobs; nothing was run")
     assert not (tmp_path / "outputs").exists()
@@ -122,8 +119,7 @@ def test_wrong_words_are_one_line_before_anything_runs(tmp_path, words, expected
 
 def test_figures_when_they_are_asked_for(tmp_path):
     words = ["time.samples=51", "estimator.gamma=1e8", "hydra.sweep.dir=sweep"]
-    done = gpebo("run", "-m", "figures=[regressor]", *words, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    printed(gpebo("run", "-m", "figures=[regressor]", *words, cwd=tmp_path))
     assert [path.name for path in tmp_path.glob("sweep/0/figures/*")] == ["regressor.png"]
 
 
@@ -192,8 +188,7 @@ def test_killed_and_resumed_is_as_if_nothing_had_happened(tmp_path, uninterrupte
     before = stamps(sweep)
     listed = gpebo(*SWEEP, "resume=sweep", "--dry-run", cwd=tmp_path)
     assert f"8 jobs, {len(before)} of them done; nothing was run" in listed.stdout
-    done = gpebo(*SWEEP, "resume=sweep", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    printed(gpebo(*SWEEP, "resume=sweep", cwd=tmp_path))
     after = stamps(sweep)
     assert {path: after[path] for path in before} == before, "a finished job is never run again"
     assert without_seconds(sweep) == without_seconds(uninterrupted)
@@ -334,11 +329,10 @@ def test_quiet_and_verbose(tmp_path, word, out, err):
 @pytest.fixture(scope="module")
 def compared(uninterrupted, tmp_path_factory):
     folder = tmp_path_factory.mktemp("compared")
-    done = gpebo(
+    said = printed(gpebo(
         "compare", uninterrupted, "--csv", "all.csv", "--output", "drawn", cwd=folder
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    return folder, done.stdout
+    ))
+    return folder, said
 
 
 def test_the_comparison_is_sorted_and_agrees_with_the_sweep(compared, uninterrupted):
@@ -371,9 +365,8 @@ def test_a_folder_of_runs_and_sweeps_stands_for_all_of_them(compared, uninterrup
     (tmp_path / "all").mkdir()
     (tmp_path / "all" / "sweep").symlink_to(uninterrupted)
     (tmp_path / "all" / "other").mkdir()
-    done = gpebo("compare", "all", "--no-figures", cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert len(done.stdout.splitlines()) == 1 + len(rows(uninterrupted)), direct
+    said = printed(gpebo("compare", "all", "--no-figures", cwd=tmp_path))
+    assert len(said.splitlines()) == 1 + len(rows(uninterrupted)), direct
 
 
 def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path):
@@ -381,11 +374,10 @@ def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path
     assert gpebo("run", *words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0
     assert gpebo("run", "estimator=drem", *FAST, "hydra.run.dir=b", cwd=tmp_path).returncode == 0
     words = ["compare", "a", "b", "--sort", "rms_error_states", "--reverse", "--output=drawn"]
-    done = gpebo(*words, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
+    said = printed(gpebo(*words, cwd=tmp_path))
     names = {path.stem for path in (tmp_path / "drawn").iterdir()}
     assert names == {"errors", "over_gamma", "rms_error_states_over_f0_and_gamma"}
-    table = [line.split() for line in done.stdout.splitlines() if line.lstrip()[0] in "ab"]
+    table = [line.split() for line in said.splitlines() if line.lstrip()[0] in "ab"]
     values = [float(cells[-1]) for cells in table]
     assert len(values) == 7
     assert values == sorted(values, reverse=True)
