@@ -18,9 +18,12 @@ from gpebo_cli import run, simulation
 from gpebo_cli.errors import ConfigError, GpeboError, SolverError
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers._base import Measurements
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
-from gpebo_cli.simulation.newton import _refuse_slow
+from gpebo_cli.simulation.newton import _refuse_slow, _window
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -223,6 +226,49 @@ def test_the_linearisation_is_the_derivative():
     np.testing.assert_allclose(c.A[1], slope, atol=1e-5)
 
 
+def test_signals_are_taken_at_the_time_itself_but_where_something_switches():
+    """At ends of elements they were a little aside: an error of 1e-9 of an element's change."""
+    plant = plant_from_mapping({
+        "name": "kinked", "states": ["x"], "inputs": {"u": "exp(3*t)"}, "outputs": ["y"],
+        "E": [[1]], "A": [["-abs(y)"]], "phi": ["u"], "C": [[1]], "initial_state": [-1.0],
+    })
+    found = simulate(plant, TimeSettings(horizon=2.0), SOLVER).signals
+    linear, mesh = Linearised(plant, found.states), found.mesh
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    passed = np.abs(t - linear.switched) < 1e-9
+    assert 0 < passed.sum() < 4  # beside that, y has a sign
+    x = found.states(t, inside)[:, 0]
+    # A x + phi there, the derivative of -|x| x with respect to x being in A.
+    c = linear.taylor(t, 0, inside)
+    right = c.A[0, :, 0, 0] * x + c.phi[0, :, 0]
+    exact = np.exp(3 * t) - np.abs(x) * x
+    np.testing.assert_allclose(right[~passed], exact[~passed], rtol=1e-13)
+    seen = Measurements(found.inputs, found.outputs).at(t, inside, plant)
+    np.testing.assert_allclose(seen[~passed, 0], np.exp(3 * t[~passed]), rtol=1e-13)
+    side = np.sign(seen[passed, 1])
+    assert (side == np.sign(inside[passed] - linear.switched)).all()
+
+
+def test_an_output_may_switch_together_with_a_function_of_time():
+    """Both instants differ by rounding: an element's last node was on the wrong side of one."""
+    x1, x2 = "sin(1.3829*t + 1.4984)", "(cos(1.2204*t + 3.8077) + 0.3)"
+    system = plant_from_mapping({
+        "name": "together", "states": ["x1", "x2"], "outputs": ["y"],
+        "inputs": {"u": "sin(1.9326*t)"},
+        "E": [[1, 0], [0, 1]], "A": [[-1, 0.4], [0.3, "-0.8 - 0.5*sign(y - 0.2)"]],
+        "B": [[0.7], [0.2]], "C": [[1, 0]],
+        "phi": [f"d({x1}) + {x1} - 0.4*{x2} - 0.7*u",
+                f"d({x2}) - 0.3*{x1} + (0.8 + 0.5*sign({x1} - 0.2))*{x2} - 0.2*u"],
+        "initial_state": [np.sin(1.4984), np.cos(3.8077) + 0.3],
+    })  # fmt: skip
+    found = simulate(system, TimeSettings(horizon=10.0), SOLVER)
+    t = np.linspace(0, 10, 301)
+    exact = np.stack([np.sin(1.3829 * t + 1.4984), np.cos(1.2204 * t + 3.8077) + 0.3], axis=1)
+    error = np.abs(found.signals.states(t) - exact).max(axis=0)
+    assert (error <= 5 * found.state_errors * np.abs(exact).max(axis=0)).all()
+    assert error.max() < 1e-11
+
+
 def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     """A transistor that is off; one that conducts has its conductance."""
     plant = plant_from_mapping({
@@ -266,13 +312,33 @@ def test_where_a_solution_ends_is_named_with_its_time(plant, near, monkeypatch):
     assert not failed  # iterates that grow without bounds are not solved: that takes long
 
 
-@pytest.mark.parametrize(("half", "slows"), [(0.998, True), (0.95, False)])
-def test_windows_that_shrink_towards_a_time_are_refused_early(half, slows):
+@pytest.mark.parametrize(("half", "then", "slows"), [
+    (0.998, [0.9985, 0.9988, 0.999], True),
+    (0.95, [0.96, 0.98, 0.999], False),
+    (0.999, [0.999, 0.999, 0.999], False),  # windows were too long
+])  # fmt: skip
+def test_windows_that_shrink_towards_a_time_are_refused_early(half, then, slows):
     """Of 90 s allowed 4 have led to t = 0.999 of 10; the last two of these from ``half``."""
-    time, spent = TimeSettings(horizon=10.0), [(0.0, 0.0), (2.0, half), (4.0, 0.999)]
+    time, spent = TimeSettings(horizon=10.0), [(0.0, 0.0), (2.0, half)]
+    spent += zip([3.0, 3.5, 4.0], then, strict=True)
     refused = pytest.raises(SolverError, match=r"slows down towards t = 0\.999")
     with refused if slows else nullcontext():
         _refuse_slow(lorenz(), time, spent, 90.0)
+
+
+@pytest.mark.parametrize(("share", "most"), [(0.25, 22), (0.45, 8)])
+def test_iterates_go_on_as_long_as_they_will_do(share, most):
+    """Past a jump, each change is a share of the one before."""
+    mesh, solved = Mesh(np.array([0.0, 1.0]), radau_rule(5)), []
+
+    def solve(*_):
+        solved.append(len(solved))
+        return Trajectory(mesh, np.full((1, 6, 3), 1.0 + share ** len(solved)))
+
+    done = pytest.raises(SolverError, match="does not converge") if most == 8 else nullcontext()
+    with done:
+        _window(lorenz(), TimeSettings(horizon=1.0), SOLVER, solve)
+    assert most - 4 <= len(solved) <= most
 
 
 def test_a_pole_of_time_is_named_before_windows_shrink_towards_it():

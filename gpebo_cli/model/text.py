@@ -22,6 +22,7 @@ from gpebo_cli.model.expressions import (
     aside,
     breakpoints,
     divisors_of,
+    on_their_side,
     record,
     resolved,
     resolved_along,
@@ -143,14 +144,20 @@ class TextCoefficients:
 
     def _tabled(self, t: Array, order: int, inside: Array | None) -> tuple[Coefficients, Array]:
         """What the text says without tables, and [u; 0] (order + 1, N, m + r) with them."""
-        found = Coefficients._make(self.of_time.assembly.taylor(t, order, inside))
-        # Nothing depends on y.
-        known = np.concatenate([found.u, np.zeros((order + 1, len(t), len(self.outputs)))], axis=2)
         inside = t if inside is None else inside
-        there = aside(t, inside) if self._of_tables.outputs else t  # on its side of what switches
-        for k, table in self.tables.items():
-            known[:, :, k] = table.taylor(there, order, inside)
-        return found, known
+
+        def told(t: Array, there: Array, inside: Array, order: int) -> tuple[Coefficients, Array]:
+            found = Coefficients._make(self.of_time.assembly.taylor(t, order, inside))
+            # Nothing depends on y.
+            nothing = np.zeros((order + 1, len(t), len(self.outputs)))
+            known = np.concatenate([found.u, nothing], axis=2)
+            for k, table in self.tables.items():
+                known[:, :, k] = table.taylor(there, order, inside)
+            return found, known
+
+        arguments = self._of_tables if self._of_tables.outputs else None
+        there = on_their_side(arguments, t, inside, lambda t, at: told(t, t, at, 0)[1][0])
+        return told(t, there, inside, order)
 
     @cached_property
     def _of_tables(self) -> Tape:

@@ -15,7 +15,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, differential_order
-from gpebo_cli.model.expressions import aside
+from gpebo_cli.model.expressions import on_their_side
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
 from gpebo_cli.numerics.rows import Rows
@@ -87,10 +87,11 @@ class Measurements:
 
         Where matrices of the ``system`` switch at t, signals are on their side of that.
         """
-        there = t
-        if inside is not None and system is not None and switching(system.coefficients):
-            there = aside(t, inside)
-        return np.concatenate([self.inputs(there, inside), self.outputs(there, inside)], axis=1)
+        def seen(t: Array, inside: Array | None) -> Array:
+            return np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
+
+        arguments = None if system is None else switching(system.coefficients)
+        return seen(on_their_side(arguments, t, inside, seen), inside)
 
     def check_memory(self, system: DescriptorSystem, times: float = 1.0) -> None:
         """Refuse a recording whose samples make more than memory holds (ConfigError).

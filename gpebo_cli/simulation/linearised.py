@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
-from gpebo_cli.model.expressions import Tape, aside, switched, with_others
+from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
 from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory
@@ -78,7 +78,9 @@ class Linearised:
         """Those of functions of time, and where outputs of the guess pass a jump or a kink."""
         found = self.system.coefficients.breakpoints(start, stop)
         inner = self.switched[(self.switched > start) & (self.switched < stop)]
-        return with_others(np.array([start, *found, stop]), inner)[1:-1]
+        inner = with_others(np.array([start, stop]), inner)
+        # Functions of time are decided well inside of elements, and outputs beside their ends.
+        return with_others(inner, found)[1:-1]
 
     @cached_property
     def switched(self) -> Array:
@@ -109,7 +111,8 @@ class Linearised:
         source = self.system.coefficients
         known, x, along = self._along(t, order, inside, signals)
         c = source.taylor(t, order, inside, along)
-        y, there = along[0, :, self.system.m :].copy(), self._there(t, inside)
+        y = along[0, :, self.system.m :].copy()
+        there = t if inside is None else aside(t, inside)
         size = np.abs(y)
         shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
 
@@ -150,23 +153,26 @@ class Linearised:
 
         Where something switches, the guess is on its side of that.
         """
-        source = self.system.coefficients
-        known = source.of_time.taylor(t, order, inside, signals)
+        there = on_their_side(
+            self._switching, t, inside, lambda t, inside: self._seen(t, 0, inside)[2][0]
+        )
+        known, x, along = self._seen(t, order, inside, signals)
+        if there is not t:
+            _, x, along = self._seen(there, order, inside, signals)
+        return known, x, along
+
+    def _seen(
+        self, t: Array, order: int, inside: Array | None, signals: Array | None = None
+    ) -> tuple[Coefficients, Array, Array]:
+        """As :meth:`_along` at the times t (N,) themselves."""
+        known = self.system.coefficients.of_time.taylor(t, order, inside, signals)
         if self.theta is not None:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
-        there = self._there(t, inside)
-        x = self.guess.taylor(there, order, inside)
+        x = self.guess.taylor(t, order, inside)
         y = taylor_product(known.C, x) + taylor_product(known.D, known.u)
         y += taylor_product(known.H, known.theta)
-        u = known.u
-        if there is not t and self.system.m:
-            u = source.of_time.taylor(there, order, inside, signals).u
-        return known, x, np.concatenate([u, y], axis=2)
-
-    def _there(self, t: Array, inside: Array | None) -> Array:
-        """Where the guess is looked at for the times t (N,)."""
-        return t if inside is None or self._switching is None else aside(t, inside)
+        return known, x, np.concatenate([known.u, y], axis=2)
 
 
 def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bool]:

@@ -24,7 +24,8 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
 
-_MOST_ITERATES = 12
+_MOST_ITERATES = 30  # past a jump each takes a share of the change before, and not its square
+_TOLD = 8  # iterates, after which the last share tells whether that will do
 _FAST = 6  # iterates: a window that needs no more may be followed by a longer one
 _LOOSE = 1e-4  # tolerance of iterates that are far from the solution
 _NEAR = 1e-2  # change from which on iterates are worth the full tolerance
@@ -36,6 +37,7 @@ _AROUND = 1e-3  # of the horizon: a refusal so near to where the solution ends i
 _SAFETY = 10.0
 _PART = 0.2  # of the computing time allowed, after which it is known whether that will do
 _SOON, _HOPELESS = 0.04, 10.0  # or after so little of it, where the rest takes times all of it
+_PACE = 3  # windows that say how fast it goes on
 
 
 @dataclass(frozen=True)
@@ -116,9 +118,10 @@ def _refuse_slow(
     shrink, and what is left of the horizon takes times the seconds allowed at the last pace.
     """
     taken, t = spent[-1]
-    half = next(then for seconds, then in spent if seconds >= 0.5 * taken)
+    late = [then for seconds, then in spent if seconds >= 0.5 * taken]
     left = (time.start + time.horizon - t) * 0.5 * taken
-    shrink = taken > _SOON * most and left > _HOPELESS * most * (t - half)
+    shrink = taken > _SOON * most and left > _HOPELESS * most * (t - late[0])
+    shrink = shrink and len(set(late)) > _PACE  # else windows were only too long
     if shrink or taken > max(_PART, (t - time.start) / time.horizon) * most:
         near = f", and it slows down towards t = {t:.6g}" if shrink else ""
         raise SolverError(
@@ -157,7 +160,11 @@ def _window(
         expected = min(change, _SAFETY * growth * change * change)
         if full and expected <= solver.tol:
             return found, count, work, expected
-        if not np.isfinite(change) or (count > 2 and change > _SHRINKS * before):
+        share = _SHRINKS
+        if count >= _TOLD:
+            left = solver.tol / max(change, solver.tol)
+            share = min(share, left ** (1.0 / (_MOST_ITERATES - count + 1)))
+        if not np.isfinite(change) or (count > 2 and change > share * before):
             break
         guess, before, was_full = found, change, full
     said = (

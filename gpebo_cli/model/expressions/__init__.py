@@ -26,10 +26,17 @@ from gpebo_cli.model.expressions.bounds import (
 )
 from gpebo_cli.model.expressions.nodes import divisors_of
 from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
-from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, record, taylor
+from gpebo_cli.model.expressions.tape import (
+    Assembly,
+    Tape,
+    aside,
+    on_their_side,
+    record,
+    taylor,
+)
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",
-    "breakpoints", "divisors_of", "halved", "parse", "record", "resolved", "resolved_along",
-    "shorten", "signal", "switched", "taylor", "with_others",
+    "breakpoints", "divisors_of", "halved", "on_their_side", "parse", "record", "resolved",
+    "resolved_along", "shorten", "signal", "switched", "taylor", "with_others",
 ]

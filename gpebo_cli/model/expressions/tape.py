@@ -7,7 +7,7 @@ and value get the same place on the tape. A tape is flat, so it copies to other 
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -27,6 +27,7 @@ MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
 _SWITCHES = ("abs", "sign", "min", "max")
 _ASIDE = 1e-6  # of a way that is itself 1e-3 of an element: a signal hardly moves there
+_CLEAR = 0.5  # of an argument of a switch: one that moves by less on that way is decided anywhere
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
 # Order, whether jumps are decided at other times, how many coefficients of how many signals.
@@ -406,6 +407,31 @@ def _labels(
 def aside(t: Any, inside: Any) -> Any:
     """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
     return t + _ASIDE * (inside - t)
+
+
+def on_their_side(
+    arguments: Tape | None, t: Array, inside: Array | None,
+    signals: Callable[[Array, Array], Array],
+) -> Array:
+    """Where signals are looked at for the times t (N,): :func:`aside` where ``arguments`` switch.
+
+    Elsewhere that would be an error of first order. ``signals`` gives values (M, number of
+    signals) at times (M,) at which what jumps is decided at others (M,).
+    """
+    if arguments is None or inside is None or inside is t:
+        return t
+    moved = np.flatnonzero(inside != t)
+    within, there = inside[moved], aside(t[moved], inside[moved])
+    at, beside = (
+        arguments.taylor(there, 0, within, signals(times, within)[None])[0]
+        for times in (t[moved], there)
+    )
+    near = (np.abs(beside - at) > _CLEAR * np.abs(beside)).any(axis=1)
+    if not near.any():
+        return t
+    found = t.copy()
+    found[moved[near]] = there[near]
+    return found
 
 
 def taylor(
