@@ -35,6 +35,14 @@ def shipped(name: str, **changes: Any) -> DescriptorSystem:
     return plant_from_mapping({**files.shipped(f"plant/{name}"), **changes}, f"{name}.yaml")
 
 
+def one_state(**entries: Any) -> dict[str, Any]:
+    """x' = 0 with y = x from 1, and what else is said of it."""
+    return {
+        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]], "C": [[1]],
+        "initial_state": [1], **entries,
+    }  # fmt: skip
+
+
 def reference(name: str) -> dict[str, Any]:
     """Reference values computed by another method and another code."""
     return json.loads((DATA / "reference" / f"{name}.json").read_text(encoding="utf-8"))

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from plants import DATA, seen
+from plants import DATA, one_state, seen
 from processes import write_table
 
 from gpebo_cli import run
@@ -236,10 +236,7 @@ def test_a_plant_that_amplifies_errors_says_how_accurate_it_is():
 
 @pytest.mark.parametrize(("deviation", "stated"), [(0.0, True), (0.1, False)])
 def test_noise_of_an_input_that_stands_in_the_matrices_has_no_linear_response(deviation, stated):
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
-        "E": [[1]], "A": [["-1 - u"]], "B": [[1]], "C": [[1]], "initial_state": [1],
-    })
+    system = plant_from_mapping(one_state(inputs={"u": "sin(t)"}, A=[["-1 - u"]], B=[[1]]))
     signals = simulate(system, TimeSettings(horizon=1.0), SolverSettings()).signals
     noise = SignalNoise(np.array([deviation]), np.ones(1), 0.01)
     found = observe(system, replace(seen(signals), noise=noise), SolverSettings())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import shipped
+from plants import one_state, shipped
 from processes import printed
 
 from gpebo_cli import run
@@ -90,11 +90,7 @@ def test_an_unsolvable_plant_stops_at_the_first_assumption():
 
 
 def test_growth_of_the_fundamental_matrix_is_reported():
-    growing = plant_from_mapping({
-        "name": "g", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[1]], "C": [[1]],
-        "initial_state": [1],
-    })
-    names = found(growing)
+    names = found(plant_from_mapping(one_state(A=[[1]])))
     assert names["Growth of Φ"].evidence["largest_entry"] == pytest.approx(np.exp(20), rel=1e-9)
     assert not names["Growth of Φ"].holds
 

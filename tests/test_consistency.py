@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from plants import one_state
 
 from benchmarks.honesty import made
 from gpebo_cli import load_plant
@@ -161,10 +162,7 @@ def test_scalings_undo_units(seed, n, of_E):
 
 def test_no_piece_between_jumps_goes_unprobed():
     """A rank may be lost in one of many short pieces alone."""
-    plant = plant_from_mapping({
-        "name": "switched", "states": ["x"], "E": [[1]], "A": [["sign(sin(150*t)) - 2"]],
-        "initial_state": [1],
-    })
+    plant = plant_from_mapping(one_state(A=[["sign(sin(150*t)) - 2"]]))
     pieces = np.arange(int(20.0 * 150.0 / np.pi) + 1) * np.pi / 150.0
     probed = np.searchsorted(pieces, _probe_times(plant, 0.0, 20.0))
     assert np.unique(probed).tolist() == list(range(1, len(pieces) + 1))

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from pandas import DataFrame
+from plants import one_state
 from scipy.integrate import quad, solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.special import erf
@@ -21,10 +22,7 @@ FUNCTIONS = {
     "linear": lambda t: np.interp(t, T, U),
     "cubic": CubicSpline(T, U),
 }
-PLANT = {
-    "name": "driven", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[-1]], "B": [[1]],
-    "C": [[1]], "initial_state": {"x": 0.5},
-}
+PLANT = one_state(name="driven", A=[[-1]], B=[[1]], initial_state={"x": 0.5})
 
 
 def table(folder):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import CONF, observed, reference, shipped
+from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
 
@@ -739,10 +739,7 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
 def test_a_gain_that_nobody_set_is_raised_where_it_is_too_small(slower, expected):
     """Δ is nearly one: γ∫Δ² = γ T, and what it needs is ln 100, whatever the unit of time."""
     horizon = 20.0 * slower
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "unknowns": {"a": 2}, "outputs": ["y"], "E": [[1]],
-        "A": [[0]], "F": [["1e6"]], "C": [["1e6"]], "initial_state": [1],
-    })  # fmt: skip
+    system = plant_from_mapping(one_state(unknowns={"a": 2}, F=[["1e6"]], C=[["1e6"]]))
     found = run_experiment(Settings(
         estimator={"name": "ls_drem"}, time=TimeSettings(horizon=horizon, samples=11)
     ), system).estimation

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from examples import assert_repeats, gpebo
-from plants import experiment, seen, shipped
+from plants import experiment, one_state, seen, shipped
 from processes import printed, rows_of
 from test_cli import FAST, folders
 from test_observer import ROTATING
@@ -304,10 +304,7 @@ def test_the_table_does_not_ask_since_when_a_moving_parameter_is_known():
 @pytest.mark.parametrize("level", ["given", "from the residual"])
 def test_a_recording_has_its_own_sample_times_and_noise(level):
     """A constant level, measured at uneven times: its deviation is that of the mean of the data."""
-    plant = {
-        "name": "level", "states": ["x"], "outputs": ["y"], "initial_state": {"x": 0},
-        "E": [[1]], "A": [[0]], "C": [[1]],
-    }
+    plant = one_state(initial_state=[0])
     rng, sigma = np.random.default_rng(4), 0.3
     h = np.concatenate([np.full(200, 0.1), [4.0], np.full(200, 0.1)])
     t = np.concatenate([[0.0], np.cumsum(h)])
@@ -367,11 +364,9 @@ def test_the_error_estimate_is_that_of_a_finer_solution(hold):
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(0.02, 0.3, 60))
     data = {"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
-    plant = {
-        "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
-        "outputs": ["y"], "E": [[1]], "A": [[-1]], "F": [["u", -1]], "C": [[1]],
-        "initial_state": {"h": 0},
-    }
+    plant = one_state(
+        inputs={"u": 0}, unknowns={"gain": 1, "leak": 1}, A=[[-1]], F=[["u", -1]], initial_state=[0]
+    )
     rough, fine = (
         api_run(
             plant, observer="kalman_bucy", data={**data, "hold": hold}, solver={"tol": tol},

@@ -12,7 +12,7 @@ import yaml
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import shipped
+from plants import one_state, shipped
 from processes import assert_refused, printed, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
@@ -307,11 +307,9 @@ def test_check_tells_the_deviation_that_a_run_with_noise_has():
 
 def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model():
     """Of a + b only the sum is known; the fit of the recording has it, and says so."""
-    plant = {
-        "name": "sum", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
-        "unknowns": {"a": 0.5, "b": 0.3}, "E": [[1]], "A": [[-1]], "B": [[1]], "F": [[1, 1]],
-        "C": [[1]], "initial_state": {"x": 1},
-    }
+    plant = one_state(
+        inputs={"u": "sin(t)"}, unknowns={"a": 0.5, "b": 0.3}, A=[[-1]], B=[[1]], F=[[1, 1]]
+    )
     truth = run(plant, observer="none")
     data = {"t": truth.t, "u": truth["u"], "y": truth["y"]}
     result = run(plant, data=data, noise={"name": "gaussian", "outputs": 0.01})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import shipped
+from plants import one_state, shipped
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.experiment.noise import measure, noise_levels
@@ -71,11 +71,10 @@ def test_without_noise_the_copy_changes_nothing():
 def test_unknowns_in_a_noisy_output_are_linearised_with_it():
     """y = x + b, x' = −y² + θ: with the bias b of the sensor, which is not the output's noise."""
     def plant(theta, bias, start):
-        return plant_from_mapping({
-            "name": "p", "states": ["x"], "outputs": ["y", "z"], "E": [[1]], "A": [[0]],
-            "unknowns": {"theta": theta, "b": bias}, "F": [[1, 0]], "phi": ["-y**2 + sin(3*t)"],
-            "C": [[1], [1]], "H": [[0, 1], [0, 0]], "initial_state": [start],
-        })  # fmt: skip
+        return plant_from_mapping(one_state(
+            outputs=["y", "z"], unknowns={"theta": theta, "b": bias}, F=[[1, 0]],
+            phi=["-y**2 + sin(3*t)"], C=[[1], [1]], H=[[0, 1], [0, 0]], initial_state=[start],
+        ))
 
     system = plant(2.0, 0.5, 0.3)
     signals = simulate(system, TimeSettings(horizon=4.0), SolverSettings()).signals

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plants import one_state
 
 from gpebo_cli import check, run
 
@@ -44,11 +45,7 @@ def test_the_deviation_of_what_is_recovered_is_that_of_the_seeds(page):
 
 def leak(u, unknowns, F, phi=0):
     """x' = −θ₁ y + θ₂ u + θ₁ θ₂ with θ = (0.5, 2)."""
-    return {
-        "name": "leak", "states": ["x"], "inputs": {"u": u}, "outputs": ["y"], "E": [[1]],
-        "A": [[0]], "B": [[0]], "C": [[1]], "initial_state": [1], "unknowns": unknowns, "F": [F],
-        "phi": [phi],
-    }  # fmt: skip
+    return one_state(inputs={"u": u}, unknowns=unknowns, B=[[0]], F=[F], phi=[phi])
 
 
 PRODUCTS = ({"p": 0.5, "q": 2, "pq": 1}, ["-y", "u", 1])

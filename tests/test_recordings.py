@@ -17,7 +17,7 @@ import yaml
 from examples import assert_repeats, gpebo
 from hypothesis import given
 from hypothesis import strategies as st
-from plants import experiment, shipped
+from plants import experiment, one_state, shipped
 from processes import assert_refused, printed, refused, write_table
 from scipy.io import savemat
 
@@ -663,10 +663,8 @@ def test_a_look_at_a_file_finds_its_columns(tmp_path, name):
 
 
 def test_an_output_called_T_is_no_time(tmp_path):
-    plant = {"name": "oven", "states": ["x"], "outputs": ["T"], "E": [[1]], "A": [[-1]],
-             "C": [[1]], "initial_state": {"x": 1}}
     (tmp_path / "log.csv").write_text("Datum;T\n31.05.2024 9:00:00;1,5\n31.05.2024 9:00:01;2,5\n")
-    found = guess(str(tmp_path / "log.csv"), plant_from_mapping(plant, "oven.yaml"))
+    found = guess(str(tmp_path / "log.csv"), plant_from_mapping(one_state(outputs=["T"])))
     assert (found.columns, found.time_unit) == ({"t": "Datum", "T": "T"}, "datetime")
 
 
@@ -732,8 +730,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     t = np.arange(0.0, 2.0, 0.02)
     y = 1.0 + np.sin(t)
     y[[7, 30, 31]] = 9999.0
-    plant = {"name": "level", "states": ["x"], "outputs": ["y"], "initial_state": {"x": 0},
-             "E": [[1]], "A": [[0]], "phi": ["cos(t)"], "C": [[1]]}
+    plant = one_state(name="level", phi=["cos(t)"], initial_state=[0])
     (tmp_path / "plant").mkdir()
     (tmp_path / "plant" / "level.yaml").write_text(yaml.safe_dump(plant))
     write_table(tmp_path / "log.csv", {"t": t, "y": y})
@@ -822,11 +819,9 @@ def test_a_recorded_state_that_ends_at_zero_is_judged_by_its_size_over_time():
     """x = sin(πt/5) is zero at t = 20: an error of 1e-4 there is not large beside it."""
     t = np.linspace(0, 20, 4001)
     x, slope = np.sin(np.pi * t / 5), np.pi / 5 * np.cos(np.pi * t / 5)
-    plant = {
-        "name": "p", "states": ["x"], "outputs": ["y"], "inputs": {"u": "0"}, "F": [[1]],
-        "unknowns": {"k": 0.5}, "E": [[1]], "A": [[-1]], "B": [[1]], "C": [[1]],
-        "initial_state": [0],
-    }
+    plant = one_state(
+        inputs={"u": 0}, unknowns={"k": 0.5}, A=[[-1]], B=[[1]], F=[[1]], initial_state=[0]
+    )
     recorded = pd.DataFrame({"t": t, "u": slope + x - 0.5, "y": x})
     result = run(
         plant, data=recorded, estimator={"name": "least_squares", "f0": 1e-3}
@@ -843,11 +838,7 @@ def test_a_recording_says_whether_what_follows_its_signals_is_bounded(gain, boun
     """In more elements than the fewest cells, too; where there is no end of pulses, it is said."""
     monkeypatch.setattr("gpebo_cli.model.expressions.bounds._MOST_ALONG", 16)
     t = np.linspace(0.0, 6.0, 61)
-    plant = {
-        "name": "follower", "states": ["x"], "inputs": {"u": 0}, "unknowns": {"a": 1},
-        "outputs": ["y"], "E": [[1]], "A": [[-1]], "F": [[gain]], "C": [[1]],
-        "initial_state": {"x": 1},
-    }
+    plant = one_state(inputs={"u": 0}, unknowns={"a": 1}, A=[[-1]], F=[[gain]])
     found = run(plant, data={"t": t, "u": np.sin(t), "y": np.exp(-t)}, estimator="least_squares")
     assert found.details.recording.bounded == bounded
     assert ("nothing bounds what functions that change so often" in found.verdict) != bounded

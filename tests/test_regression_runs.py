@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from examples import assert_repeats, gpebo
+from plants import one_state
 from processes import assert_refused, printed, rows_of, write_table
 
 from gpebo_cli import ConfigError, SolverError, check, run
@@ -210,10 +211,9 @@ def test_a_narrow_pulse_is_seen_wherever_it_stands(psi):
 
 
 def test_a_start_beyond_all_numbers_is_refused_in_one_line():
-    content = {
-        "name": "mine", "states": ["x"], "inputs": {"u": "sin(t)"}, "unknowns": {"th": 1.5},
-        "outputs": ["y", "z"], "E": [[1]], "A": [[1]], "B": [[16]], "F": [[2.5]],
-        "C": [[1e-300], [1]], "initial_state": {"x": 1},
-    }
+    content = one_state(
+        inputs={"u": "sin(t)"}, unknowns={"th": 1.5}, outputs=["y", "z"], A=[[1]], B=[[16]],
+        F=[[2.5]], C=[[1e-300], [1]],
+    )
     with pytest.raises(SolverError, match="beyond all numbers at t = 0"):
         run(content, solver="ivp", time={"horizon": 1, "samples": 11})

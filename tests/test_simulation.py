@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import reference, shipped
+from plants import one_state, reference, shipped
 from processes import refused
 from scipy.integrate import solve_ivp
 from scipy.optimize import OptimizeResult
@@ -295,9 +295,9 @@ def test_true_error_is_within_ten_tolerances_and_ten_estimates(name, tol):
 
 @pytest.mark.parametrize("rate", [-1.0, 1.0, 2.0])
 def test_the_independent_path_knows_how_far_its_errors_have_grown(rate):
-    plant = {"name": "p", "states": ["x"], "outputs": ["y"], "C": [[1]], "E": [[1]],
-             "inputs": {"u": f"cos(t) - ({rate})*sin(t)"}, "A": [[rate]], "B": [[1]],
-             "initial_state": [0.0]}
+    plant = one_state(
+        inputs={"u": f"cos(t) - ({rate})*sin(t)"}, A=[[rate]], B=[[1]], initial_state=[0]
+    )
     found = run(plant, time={"horizon": 9, "samples": 91}, solver="ivp",
                 observer="none").details.simulation
     error = np.abs(found.states[:, 0] - np.sin(found.t)).max()

@@ -10,7 +10,7 @@ import pytest
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import shipped
+from plants import one_state, shipped
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -159,10 +159,9 @@ def test_manufactured_solutions_of_higher_index(name):
 def test_logistic_growth_with_any_numbers(growth, share, capacity):
     """x' = r x (1 − x/K), solved by x = K/(1 + (K/x0 − 1) e^{−r t})."""
     start = share * capacity
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "C": [[1]],
-        "A": [[f"{growth}*(1 - y/{capacity})"]], "initial_state": [start],
-    })  # fmt: skip
+    system = plant_from_mapping(
+        one_state(A=[[f"{growth}*(1 - y/{capacity})"]], initial_state=[start])
+    )
     t = np.linspace(0, 5, 21)
     found = simulate(system, TimeSettings(horizon=5.0), SOLVER)
     expected = capacity / (1 + (capacity / start - 1) * np.exp(-growth * t))
@@ -171,10 +170,9 @@ def test_logistic_growth_with_any_numbers(growth, share, capacity):
 
 def test_jumps_of_inputs_are_followed():
     """x' = −x² + u with a step of u: both pieces have closed forms."""
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "outputs": ["y"], "inputs": {"u": "step(t - 1)"},
-        "E": [[1]], "A": [["-y"]], "B": [[1]], "C": [[1]], "initial_state": [2],
-    })  # fmt: skip
+    system = plant_from_mapping(
+        one_state(inputs={"u": "step(t - 1)"}, A=[["-y"]], B=[[1]], initial_state=[2])
+    )
     t = np.linspace(0, 3, 31)
     found = simulate(system, TimeSettings(horizon=3.0), SOLVER)
     before = 1 / (t + 0.5)
@@ -302,12 +300,8 @@ def test_where_a_solution_ends_is_named_with_its_time(plant, near, monkeypatch):
             raise
 
     monkeypatch.setattr(simulation.simulate, "solve", solve)
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "C": [[1]],
-        "initial_state": [1], **plant,
-    })  # fmt: skip
     with pytest.raises(GpeboError, match="beyond t = ") as caught:
-        simulate(system, TimeSettings(horizon=3.0), SOLVER)
+        simulate(plant_from_mapping(one_state(**plant)), TimeSettings(horizon=3.0), SOLVER)
     assert float(str(caught.value).split("beyond t = ")[1].split()[0]) == pytest.approx(1, abs=near)
     assert not failed  # iterates that grow without bounds are not solved: that takes long
 
@@ -430,10 +424,7 @@ def test_the_series_resistance_of_a_battery_is_seen_in_its_output():
     ],
 )  # fmt: skip
 def test_outputs_may_pass_kinks_and_jumps_of_the_right_side(right_side, solution):
-    system = plant_from_mapping({
-        "name": "p", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]], "C": [[1]],
-        "phi": [right_side], "initial_state": [-1],
-    })  # fmt: skip
+    system = plant_from_mapping(one_state(phi=[right_side], initial_state=[-1]))
     t = np.linspace(0, 2, 41)
     found = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-10))
     np.testing.assert_allclose(found.signals.states(t)[:, 0], solution(t), atol=1e-8)
@@ -478,15 +469,11 @@ def with_friction(t, mu=0.3):
 @pytest.mark.parametrize("algebraic", [False, True])
 def test_elements_end_where_an_output_passes_a_jump(tol, algebraic):
     """Friction: with a jump within an element the error was 5e-4, and nobody was told."""
-    plant = {
-        "name": "friction", "states": ["v"], "inputs": {"u": "2*sin(t)"}, "outputs": ["y"],
-        "E": [[1]], "A": [[0]], "B": [[1]], "phi": ["-0.3*sign(y)"], "C": [[1]],
-        "initial_state": [1.0],
-    } if not algebraic else {
-        "name": "friction", "states": ["v", "f"], "inputs": {"u": "2*sin(t)"}, "outputs": ["y"],
-        "E": [[1, 0], [0, 0]], "A": [[0, 1], [0, -1]], "B": [[1], [0]],
-        "phi": [0, "-0.3*sign(y)"], "C": [[1, 0]], "initial_state": [1.0, 0.0],
-    }
+    matrices = {
+        "states": ["v", "f"], "E": [[1, 0], [0, 0]], "A": [[0, 1], [0, -1]], "B": [[1], [0]],
+        "phi": [0, "-0.3*sign(y)"], "C": [[1, 0]], "initial_state": [1, 0],
+    } if algebraic else {"states": ["v"], "B": [[1]], "phi": ["-0.3*sign(y)"]}
+    plant = one_state(inputs={"u": "2*sin(t)"}, **matrices)
     found = run(plant, solver={"tol": tol}, time={"horizon": 20.0, "samples": 201})
     error = np.abs(found["v"] - with_friction(found.t)).max()
     assert error < 1e-11

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from examples import ROOT
-from plants import shipped
+from plants import one_state, shipped
 
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
@@ -146,11 +146,10 @@ def assert_responses_add_up(system, estimator, t, u, y, hold, sigmas):
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
 
 
-TANK = {
-    "name": "tank", "states": ["h"], "inputs": {"u": 0}, "unknowns": {"gain": 1, "leak": 1},
-    "outputs": ["y"], "E": [[1]], "A": [["-1 - 0.3*u"]], "F": [["u", -1]], "C": [[1]],
-    "initial_state": {"h": 0},
-}
+TANK = one_state(
+    states=["h"], inputs={"u": 0}, unknowns={"gain": 1, "leak": 1}, A=[["-1 - 0.3*u"]],
+    F=[["u", -1]], initial_state=[0],
+)
 
 
 def noisy_rows(folder, noise, samples):
@@ -453,11 +452,10 @@ def test_a_run_without_deviations_says_why(plant, more, why):
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.01}])
 @pytest.mark.parametrize("size", [1e-6, 1e-10])  # of ψ: Δ is tiny, or rounding
 def test_an_estimate_that_was_not_moved_has_no_deviation(tmp_path, observer, size):
-    plant = {
-        "name": "tiny", "states": ["x"], "inputs": {"u": "cos(t)"}, "outputs": ["y"],
-        "unknowns": {"a": 1.0, "b": 1.0 / size}, "E": [[1]], "A": [[-1]], "B": [[1]],
-        "F": [["sin(3*t)", f"{size}*cos(2*t)"]], "C": [[1]], "initial_state": {"x": 1},
-    }
+    plant = one_state(
+        inputs={"u": "cos(t)"}, unknowns={"a": 1, "b": 1 / size}, A=[[-1]], B=[[1]],
+        F=[["sin(3*t)", f"{size}*cos(2*t)"]],
+    )
     made = run(plant, observer="none", time={"horizon": 10, "samples": 1001})
     table = np.column_stack([made.t, made["u"], made["y"]])
     np.savetxt(tmp_path / "r.csv", table, delimiter=",", header="t,u,y", comments="")
