@@ -451,7 +451,9 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         read_table(DataSettings("csv", frame=frame.set_index("t")), shipped("circuit")),
         read_table(DataSettings("csv", str(tmp_path / "r.mat")), shipped("circuit")),
     ]
-    dated = frame.set_index(pd.Timestamp("2024-01-01") + pd.to_timedelta(frame["t"], unit="s"))
+    since = pd.to_timedelta(frame["t"], unit="s")
+    tables.append(read_table(DataSettings("csv", frame=frame.assign(t=since)), shipped("circuit")))
+    dated = frame.set_index(pd.Timestamp("2024-01-01") + since)
     tables.append(
         read_table(DataSettings("csv", frame=dated.drop(columns="t")), shipped("circuit"))
     )
@@ -473,6 +475,7 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         ({"t": [0.0, 1.0, 1.0]}, "column t: 1.0 follows 1.0; times must increase"),
         ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
         ({"V": [True, False, True]}, "column V: bool"),
+        ({"V": [1.0, 2.0, 3j]}, "column V: complex128 is not numbers"),
     ],
 )
 def test_what_is_wrong_with_a_data_frame(change, part):
@@ -679,7 +682,7 @@ def test_what_is_guessed_runs_as_it_stands(tmp_path):
     said = printed(gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path))
     assert "not understood: not read: note" in said
     assert "by elimination" in said
-    words = ["plant=circuit", "data=lab_1", "estimator=ls_drem", "figures=none"]
+    words = ["plant=circuit", "data=lab_1", "estimator=ls_drem", "figures=none", "data.scale.y=1"]
     printed(gpebo("run", "--config-dir", ".", *words, "hydra.run.dir=out", cwd=tmp_path))
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["recording"]["last"] == 20.0
     again = gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path)
@@ -693,13 +696,28 @@ def test_what_is_guessed_runs_as_it_stands(tmp_path):
         (["lab.csv", "--plant", "circut"], "did you mean circuit?"),
         (["none.csv", "--plant", "circuit"], "none.csv cannot be read"),
         (["one.csv", "--plant", "circuit"], "the same number of cells"),
-        (["lab.mat", "--plant", "circuit"], "data.file=lab.mat reads it"),
+        (["lab.mat", "--plant", "circuit"], "lab.mat cannot be read"),
     ],
 )
 def test_what_cannot_be_looked_at_is_one_line(tmp_path, words, part):
     (tmp_path / "lab.csv").write_text(GOOD)
     (tmp_path / "one.csv").write_text("a\n1\n2\n")
     assert_refused(gpebo("new", "recording", *words, cwd=tmp_path), part)
+
+
+def test_a_look_at_a_table_with_types(tmp_path):
+    """Matrices are columns; what has another length than t, or is no number, is not there."""
+    t, both = np.arange(3.0), np.array([[1.0, 2.0], [np.nan, 3.0], [4.0, 5.0]])
+    path = tmp_path / "lab.mat"
+    savemat(path, {"t": t, "fs": 1e3, "long": np.zeros(9), "volt in kV": both, "y": [1, 2, 3]})
+    found = guess(str(path), shipped("circuit"))
+    assert found.columns == {"t": "t", "y": "y"}
+    savemat(path, {"t": t, "V": both, "y": [[1], [2], [3]], "long": np.zeros(9)})
+    found = guess(str(path), shipped("circuit"))
+    assert (found.columns, found.missing) == ({"t": "t", "V": "V_1", "y": "y"}, 1)
+    savemat(path, {"all": {"t": t, "V": t, "y": t}})
+    with refused("lab.mat has no vectors of numbers; fields of a struct"):
+        guess(str(path), shipped("circuit"))
 
 
 def test_signals_that_are_not_found_are_said(tmp_path):
@@ -738,7 +756,6 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     assert gpebo(*command, cwd=tmp_path).returncode == 0
     data = yaml.safe_load((tmp_path / "data" / "log.yaml").read_text())
     assert (data["gaps"], data["missing"]) == ([9999.0], "interpolate")
-    assert data["scale"] is None  # what the file does not name, no override can set
     settings = DataSettings(file=str(tmp_path / "log.csv"), missing="interpolate", gaps=[9999.0])
     system = plant_from_mapping(plant, "level.yaml")
     read = read_table(settings, system).samples.outputs[:, 0]
@@ -753,7 +770,9 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
 @pytest.mark.parametrize(("written", "unit", "factor"), [
     ("mV", "V", 1e-3), ("l/min", "l/s", 1 / 60), ("ml/min", "l/h", 0.06), ("A", "V", None),
     ("m/s", "m", None), ("kg/V", "kg/s", None), ("W", "kW", 1e-3), ("W", "mW", 1e3),
-    ("µA", "mA", 1e-3), ("in", "min", None),
+    ("µA", "mA", 1e-3), ("in", "min", None), ("l/min", "m3/s", 1e-3 / 60), ("m3/h", "L/h", 1e3),
+    ("°C", "degC", 1.0), ("°C", "K", None), ("cm²", "m2", 1e-4), ("mm", "m3", None),
+    ("rpm", "rad/s", np.pi / 30), ("mbar", "hPa", 1.0), ("kΩ", "ohm", 1e3), ("m", "V", None),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):
     assert _factor(written, unit) == (None if factor is None else pytest.approx(factor))

@@ -18,7 +18,6 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.importers.matrices import from_control
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers.reduced.invariant import invariant_observer
-from gpebo_cli.recordings.guess import guess
 from gpebo_cli.regression.text import regression_from_mapping
 from gpebo_cli.results.files import remove_files
 from gpebo_cli.settings import Settings, SolverSettings
@@ -210,8 +209,6 @@ def test_of_calls_from_python(tmp_path):
          "regression (r.yaml) must be a mapping with the keys "),
         (lambda: regression_from_mapping({"name": "r", "signals": 3}), ConfigError,
          "regression r: signals must map names to expressions"),
-        (lambda: guess("a.mat", shipped("circuit")), ConfigError,
-         "a.mat: there is nothing to guess in tables with types; data.file=a.mat reads it"),
         (lambda: remove_files([tmp_path]), GpeboError, f"cannot remove {tmp_path}: "),
     ):
         with refused(message, by=error):

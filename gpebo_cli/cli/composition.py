@@ -40,6 +40,7 @@ from gpebo_cli.errors import ConfigError
 
 _INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
 _BETWEEN = re.compile(r",(?![^(]*\))")  # commas that are not within an expression's brackets
+_BY_SIGNAL = re.compile(r"data\.(columns|scale)\.\w+=")
 _PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 
 
@@ -153,11 +154,12 @@ def _words(arguments: Arguments) -> list[str]:
     """The overrides, quoted where Hydra's grammar would not read them.
 
     A value that it cannot read is text, such as a formula (``plant.inputs.V=2*sin(t)``) or a single
-    comma; in brackets it is YAML.
+    comma; in brackets it is YAML. Signals of a recording need not be in its file before.
     """
     parser = OverridesParser.create()
     swept = "--multirun" in arguments.given.switches
-    return [_readable(parser, word, swept=swept) for word in arguments.for_hydra]
+    words = [_readable(parser, word, swept=swept) for word in arguments.for_hydra]
+    return [f"++{word}" if _BY_SIGNAL.match(word) else word for word in words]
 
 
 def _readable(parser: OverridesParser, word: str, *, swept: bool) -> str:

@@ -70,7 +70,7 @@ def text(file: str, plant: str, found: Guess) -> str:
     if found.scale:
         head.append("scale:      # factors from the file's units to the plant's")
         head += [f"  {line(s, v, reasons[f'scale.{s}'])}" for s, v in found.scale.items()]
-    else:  # a key that stands here can be given on the command line
+    else:
         head.append("scale: null    # factors from the file's units to the plant's: {V: 0.001}")
     head.append(line("gaps", found.gaps or None, reasons.get("gaps", "")))
     gaps = f"{found.missing} cells are empty; or hold, drop, refuse" if found.missing else ""

@@ -11,14 +11,26 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import isnan
+from math import isnan, pi
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.table import DATE, MISSING, TIME, check_text, read_file, seconds
+from gpebo_cli.recordings.table import (
+    DATE,
+    MISSING,
+    TIME,
+    check_text,
+    read_file,
+    seconds,
+    typed_table,
+)
 
 _SEPARATORS = (",", ";", "\t", " ")
-_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6}
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1,
+             "h": 1e2, "k": 1e3, "M": 1e6}
+_SPELLED = {"°C": "degC", "°": "deg", "Ω": "ohm", "²": "2", "³": "3", "^": ""}
+_OTHER = {"l": (1e-3, "m3"), "L": (1e-3, "m3"), "bar": (1e5, "Pa"), "deg": (pi / 180.0, "rad"),
+          "rpm": (pi / 30.0, "rad/s"), "%": (0.01, "1")}
 _TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "datum", "temps", "tiempo")
 _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
           "h": "h", "hours": "h"}
@@ -44,13 +56,12 @@ class Guess:
 
 
 def guess(path: str, system: DescriptorSystem) -> Guess:
-    """Look at the CSV file ``path`` for the signals of ``system`` (ConfigError)."""
-    if path.endswith((".mat", ".parquet")):
-        raise ConfigError(
-            f"{path}: there is nothing to guess in tables with types; data.file={path} reads it, "
-            "and data.columns says what its signals are called there"
-        )
+    """Look at the table in the file ``path`` for the signals of ``system`` (ConfigError)."""
     content = read_file(path)
+    frame = typed_table(path, content)
+    if frame is not None:
+        plain = frame.apply(lambda c: c.dt.total_seconds() if c.dtype.kind == "m" else c)
+        content = plain.to_csv(index=False).encode()
     check_text(path, content)
     lines = content.decode("utf-8-sig").rstrip().splitlines()
     found = Guess()
@@ -151,7 +162,7 @@ def _likeness(signal: str, unit: str, name: str) -> tuple[float, str]:
         return 3.0, "the same name but for capitals"
     if signal in re.findall(r"\w+", re.sub(r"[(\[].*?[)\]]", "", name)):
         return 2.5, "the name is in the header"
-    if signal in re.findall(r"\w+", name):
+    if signal in (*re.findall(r"\w+", name), *_words(name)):
         return 2.0, "the name is in the header"
     if unit and any(_factor(written, unit) is not None for written in _units(name)):
         return 1.5, "its unit"
@@ -193,9 +204,11 @@ def _find_signals(
                     f"column {name} may be in {written}, {signal} is in {unit}: "
                     f"data.scale.{signal} is the factor between them"
                 )
-            elif factor != 1.0:
-                found.scale[signal] = factor
-                found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here"
+            if factor != 1.0:
+                found.scale[signal] = factor or 1.0
+                found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here" + (
+                    "" if factor else ": WHICH FACTOR?"
+                )
 
 
 def _units(name: str) -> list[str]:
@@ -205,16 +218,35 @@ def _units(name: str) -> list[str]:
 
 
 def _factor(written: str, unit: str) -> float | None:
-    """From a unit with a prefix, or one per minute, to the unit; None: it is another one."""
+    """From a unit with a prefix, per minute, or of another name, to the unit; None: it is none."""
+    (size, written), (of_unit, unit) = _as_usual(written), _as_usual(unit)
+    top, _, below = written.partition("/")
+    wanted, _, per = unit.partition("/")
     if written == unit:
-        return 1.0
-    if "/" in written and "/" in unit:
-        (top, _, below), (wanted, _, per) = written.partition("/"), unit.partition("/")
-        factor = _factor(top, wanted)
-        if factor is not None and below in _RATES and per in _RATES:
-            return factor * _RATES[per] / _RATES[below]
-    if written.endswith(unit):
-        return _PREFIXES.get(written.removesuffix(unit))
-    prefix, base = _PREFIXES.get(unit[0]), unit[1:]
-    times = _factor(written, base) if prefix and base and unit != "min" else None
-    return times / prefix if times and prefix else None
+        return size / of_unit
+    if below in _RATES and per in _RATES:
+        times = _factor(top, wanted)
+        return times and times * _RATES[per] / _RATES[below]
+    for prefix, base in _prefixed(written):
+        for other, same in _prefixed(unit):
+            if base == same:
+                power = int(base[-1]) if base[-1] in "23" else 1
+                return (prefix / other) ** power * size / of_unit
+    return None
+
+
+def _prefixed(unit: str) -> list[tuple[float, str]]:
+    """The unit itself, and without the first letter where that may be a prefix."""
+    of_letter = _PREFIXES.get(unit[:1])
+    cut = [] if of_letter is None or unit == "min" else [(of_letter, unit[1:])]
+    return [(1.0, unit), *cut] if unit[1:] else [(1.0, unit)]
+
+
+def _as_usual(unit: str) -> tuple[float, str]:
+    """How much of which other unit it is; 1 of its own, if nothing is known."""
+    for sign, word in _SPELLED.items():
+        unit = unit.replace(sign, word)
+    if unit[1:] in _OTHER and unit[0] in _PREFIXES:
+        size, base = _OTHER[unit[1:]]
+        return _PREFIXES[unit[0]] * size, base
+    return _OTHER.get(unit, (1.0, unit))

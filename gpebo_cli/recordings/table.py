@@ -90,17 +90,24 @@ class Table:
 
 def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
     """Read the recording that ``data`` names: CSV, Parquet, MAT, or a data frame (ConfigError)."""
+    time = (data.columns or {}).get(TIME, TIME)
     if data.frame is not None:
-        return _from_frame("data", data.frame, data, system, "")
+        import pandas as pd
+
+        if not isinstance(data.frame, pd.DataFrame):
+            raise ConfigError(
+                f"data: expected a file or a pandas.DataFrame, got {shown(data.frame)}"
+            )
+        return _from_frame("data", _indexed(data.frame, time), data, system, "")
     if data.file is None:
         raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
     if not isinstance(data.file, str):
         raise ConfigError("data.file: here one file is needed, not several")
     path, content = data.file, read_file(data.file)
     sha256 = hashlib.sha256(content).hexdigest()
-    kind = os.path.splitext(path)[1].lower()
-    if kind in (".parquet", ".mat"):
-        return _from_frame(path, _frame(path, kind, content), data, system, sha256)
+    frame = typed_table(path, content, time)
+    if frame is not None:
+        return _from_frame(path, frame, data, system, sha256)
     check_text(path, content)
     content = content.removeprefix(b"\xef\xbb\xbf").replace(b"\r\n", b"\n")
     end = content.find(b"\n", len(content.rstrip(_BLANK + b"\n")))  # of the last line of all
@@ -392,10 +399,15 @@ def _plain_rows(header: Header, data: DataSettings, body: bytes) -> Array | None
     return values if whole and (np.abs(values) <= LARGEST).all() else None
 
 
-def _frame(path: str, kind: str, content: bytes) -> DataFrame:
-    """A Parquet file, or the vectors of equal length in a MAT file."""
+def typed_table(path: str, content: bytes, time: str = TIME) -> DataFrame | None:
+    """A Parquet or MAT file, as its name ends, else None (ConfigError).
+
+    Of a MAT file the vectors that are as long as that of the ``time``, or the longest, and the
+    columns of matrices as ``<name>_1``, ``<name>_2``, …
+    """
     import pandas as pd
 
+    kind = os.path.splitext(path)[1].lower()
     if kind == ".parquet":
         try:
             from pyarrow.parquet import (  # type: ignore[import-not-found,import-untyped,unused-ignore]
@@ -405,43 +417,69 @@ def _frame(path: str, kind: str, content: bytes) -> DataFrame:
             head = read_metadata(io.BytesIO(content))
             cells = head.num_rows * head.num_columns
             if cells <= _MOST_CELLS:
-                return pd.read_parquet(io.BytesIO(content), engine="pyarrow")
+                return _indexed(pd.read_parquet(io.BytesIO(content), engine="pyarrow"), time)
+        except ImportError:
+            raise ConfigError(
+                f"data.file: {path} needs pyarrow: pip install 'gpebo[parquet]'"
+            ) from None
         except Exception as error:  # a stranger's bytes: whatever a library says of them
             raise ConfigError(f"data.file: {path} cannot be read as {kind}: {error}") from error
         raise ConfigError(f"data.file: {path} has {cells} cells; at most {_MOST_CELLS} are read")
+    if kind != ".mat":
+        return None
     arrays = {k: v.squeeze() for k, v in read_mat(path).items() if isinstance(v, np.ndarray)}
-    vectors = {k: v for k, v in arrays.items() if v.ndim == 1}
-    longest = max(map(len, vectors.values()), default=0)
-    return pd.DataFrame({k: v for k, v in vectors.items() if len(v) == longest})
+    sizes = [max(array.shape, default=0) for array in arrays.values()]
+    rows = arrays[time].size if time in arrays else max(sizes, default=0)
+    columns: dict[str, Any] = {}
+    for name, found in arrays.items():
+        wide = found.T if found.shape[1:] == (rows,) else found
+        if wide.shape == (rows,):
+            columns[name] = wide
+        elif wide.shape[:1] == (rows,) and wide.ndim == 2:
+            columns |= {f"{name}_{j}": column for j, column in enumerate(wide.T, start=1)}
+        elif wide.ndim:  # shown, where a signal is looked for
+            columns[f"{name} ({'x'.join(map(str, wide.shape))} numbers)"] = np.nan
+    if not any(np.ndim(column) for column in columns.values()):
+        raise ConfigError(
+            f"data.file: {path} has no vectors of numbers; fields of a struct can be saved as such "
+            "(save FILE -struct NAME)"
+        )
+    return pd.DataFrame(columns)
+
+
+def _indexed(frame: DataFrame, time: str) -> DataFrame:
+    """With the index as a column, if it has a name or is made of times."""
+    index = frame.index
+    if index.name is None and index.dtype.kind not in "mM":
+        return frame
+    name = time if index.name is None else str(index.name)
+    return frame.rename_axis(index=name).reset_index()
 
 
 def _from_frame(
     source: str, frame: Any, data: DataSettings, system: DescriptorSystem, sha256: str
 ) -> Table:
-    """The recording in a data frame; its index counts if it has a name or is made of times."""
-    import pandas as pd
-
-    if not isinstance(frame, pd.DataFrame):
-        raise ConfigError(f"data: expected a file or a pandas.DataFrame, got {shown(frame)}")
-    if isinstance(frame.index, pd.DatetimeIndex) or frame.index.name is not None:
-        called = (data.columns or {}).get(TIME, TIME)
-        name = called if frame.index.name is None else str(frame.index.name)
-        frame = frame.rename_axis(index=name).reset_index()
+    """The recording in a data frame."""
     header = read_header(source, [str(name) for name in frame.columns], data, system)
     columns = []
     for name, k, scale in zip(header.names, header.positions, header.scale, strict=True):
-        column = frame.iloc[:, k]
-        if pd.api.types.is_datetime64_any_dtype(column):
-            values = (column - column.iloc[0]).dt.total_seconds().to_numpy(dtype=np.float64)
-        elif pd.api.types.is_numeric_dtype(column) and not pd.api.types.is_bool_dtype(column):
+        column, of_time = frame.iloc[:, k], k == header.positions[0]
+        kind = column.dtype.kind
+        if kind in "mM":
+            column = column - column.iloc[0] if kind == "M" else column
+            values = column.dt.total_seconds().to_numpy(dtype=np.float64)
+        elif kind in "iuf":
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
-            if k != header.positions[0]:
+            if not of_time:
                 values = np.where(np.isin(values, data.gaps or ()), np.nan, values)
             values = values * scale
-        elif k == header.positions[0] and data.time_unit == "datetime":
+        elif of_time and data.time_unit == "datetime":
             values, _ = seconds([str(cell) for cell in column], None)
         else:
-            raise ConfigError(f"{source}, column {name}: {column.dtype} is not numbers")
+            raise ConfigError(
+                f"{source}, column {name}: {column.dtype} is not numbers"
+                + "; data.time_unit=datetime reads dates" * of_time
+            )
         columns.append(values)
     values = np.column_stack(columns)
     wrong = np.abs(values) > LARGEST
