@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import shipped
+from plants import BOOST, LORENZ, shipped
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
@@ -410,19 +410,6 @@ def test_derivatives_of_a_signal_are_those_of_its_polynomials():
 
 
 # Matrices along measured signals ------------------------------------------------------------------
-
-
-BOOST = {
-    "name": "boost", "states": ["i", "v"], "inputs": {"duty": "0.5 + 0.1*sin(3*t)"},
-    "unknowns": {"power": 8}, "outputs": ["y"], "E": [[0.5, 0], [0, 0.2]],
-    "A": [[-0.1, "-(1-duty)"], ["1-duty", -0.05]], "F": [[0], ["-1/y"]], "phi": [10, 0],
-    "B": [[0], [0]], "C": [[0, 1]], "initial_state": [3, 18],
-}
-LORENZ = {
-    "name": "lorenz", "states": ["x1", "x2", "x3"], "unknowns": {"rho": 28}, "outputs": ["y"],
-    "E": np.eye(3).tolist(), "A": [[-10, 10, 0], [0, -1, "-y"], [0, "y", "-8/3"]],
-    "F": [[0], ["y"], [0]], "C": [[1, 0, 0]], "initial_state": [1, 1, 20],
-}
 
 
 def solved(system, duty, horizon):

@@ -10,7 +10,7 @@ import pytest
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import one_state, shipped
+from plants import BOOST, LORENZ, one_state, shipped
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -30,23 +30,11 @@ SOLVER = SolverSettings()
 
 
 def lorenz(**entries):
-    data = {
-        "name": "lorenz", "states": ["x1", "x2", "x3"], "outputs": ["y"], "unknowns": {"rho": 28},
-        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "F": [[0], ["y"], [0]],
-        "A": [[-10, 10, 0], [0, -1, "-y"], [0, "y", "-8/3"]], "C": [[1, 0, 0]],
-        "initial_state": [1, 1, 20],
-    }  # fmt: skip
-    return plant_from_mapping({**data, **entries})
+    return plant_from_mapping(LORENZ | entries)
 
 
 def boost(**entries):
-    data = {
-        "name": "boost", "states": ["i", "v"], "inputs": {"duty": "0.5 + 0.1*sin(3*t)"},
-        "outputs": ["y"], "unknowns": {"power": 8}, "E": [["0.5", 0], [0, "0.2"]],
-        "A": [["-0.1", "-(1-duty)"], ["1-duty", "-0.05"]], "F": [[0], ["-1/y"]],
-        "phi": ["10", 0], "C": [[0, 1]], "initial_state": [3, 18],
-    }  # fmt: skip
-    return plant_from_mapping({**data, **entries})
+    return plant_from_mapping(BOOST | entries)
 
 
 def integrated(right_side, start, t):
