@@ -321,6 +321,11 @@ class Outcome(NamedTuple):
     ratio: float  # largest error over estimate, state by state
 
 
+def case_of(family: str, seed: int) -> Case:
+    """One of a family; a seed means the same case at any time."""
+    return FAMILIES[family](np.random.default_rng([list(FAMILIES).index(family), seed]))
+
+
 def measure(case: Case) -> Outcome:
     """Simulate a case and compare it with the truth."""
     before = time.process_time()
@@ -341,9 +346,8 @@ def measure(case: Case) -> Outcome:
 
 
 def outcomes(family: str, seeds: range) -> list[Outcome]:
-    """Of one family; a seed means the same case at any time."""
-    number = list(FAMILIES).index(family)
-    return [measure(FAMILIES[family](np.random.default_rng([number, seed]))) for seed in seeds]
+    """Of one family."""
+    return [measure(case_of(family, seed)) for seed in seeds]
 
 
 def row(family: str, found: list[Outcome]) -> list[str]:

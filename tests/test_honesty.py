@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.honesty import FAMILIES, TOLERANCE, made, measure, page, rotation, row
+from benchmarks.honesty import FAMILIES, TOLERANCE, case_of, made, measure, page, rotation, row
 from gpebo_cli import run
 from gpebo_cli.errors import SolverError
 from gpebo_cli.experiment.verdict import simulation_note, simulation_verdict
@@ -34,8 +34,7 @@ def test_the_estimate_of_each_state_is_honest(family, seed):
 
 def test_differential_equations_turn_with_the_range_of_E():
     """With rows of one time they were lost at a right angle to it: wrong by 1e-4, said 5e-7."""
-    case = FAMILIES["long"](np.random.default_rng([list(FAMILIES).index("long"), 67]))
-    found = measure(case._replace(horizon=30.0))
+    found = measure(case_of("long", 67)._replace(horizon=30.0))
     assert found.error < 1e-8
     assert found.ratio < 1.0
 
@@ -49,8 +48,7 @@ def test_equations_made_of_large_terms_that_cancel_know_of_their_rounding(rate):
 
 def test_rounding_of_constraints_counts_where_states_swing_by_themselves():
     """Index 3, constant matrices, 32 rad/s: a state at rest among them was wrong by 50 times."""
-    number = list(FAMILIES).index("oscillating")
-    found = measure(FAMILIES["oscillating"](np.random.default_rng([number, 27])))
+    found = measure(case_of("oscillating", 27))
     assert 1e-13 < found.error < 1e-10
     assert found.ratio < 3.0
 
@@ -60,10 +58,9 @@ def test_a_rank_that_only_rounding_supports_is_refused():
 
     One more finds other constraints, which it does not where their number is right.
     """
-    number = list(FAMILIES).index("stiff")
-    found = measure(FAMILIES["stiff"](np.random.default_rng([number, 41])))
+    found = measure(case_of("stiff", 41))
     assert "leaves no digit of its hidden constraints" in found.refused
-    found = measure(FAMILIES["stiff"](np.random.default_rng([number, 1120])))
+    found = measure(case_of("stiff", 1120))
     assert not found.refused
     assert found.ratio < 10.0
 
@@ -79,8 +76,7 @@ def test_the_page_says_what_was_found(family):
 
 def test_an_input_that_is_rounding_is_not_resolved():
     """A swing whose forcing cancels to 1e-16: functions without bounds took 98,304 elements."""
-    number = list(FAMILIES).index("oscillating")
-    case = FAMILIES["oscillating"](np.random.default_rng([number, 0]))
+    case = case_of("oscillating", 0)
     found = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings(tol=TOLERANCE))
     assert found.signals.states.mesh.size < 1000
 
@@ -113,7 +109,7 @@ def test_values_of_functions_that_are_rounding_ask_for_no_elements(constant):
 def silenced(family, seed):
     """A case of a family of which half of the states are zero, up to rounding."""
     rng = np.random.default_rng([7, seed])
-    case = FAMILIES[family](np.random.default_rng([list(FAMILIES).index(family), seed]))
+    case = case_of(family, seed)
     source, n = case.system.coefficients, case.system.n
     heard = np.sort(rng.choice(n, max(1, n // 2), replace=False))
     source = replace(
@@ -147,8 +143,7 @@ def test_states_that_are_zero_are_no_reason_for_an_alarm(family, seed):
 
 def test_a_state_without_digits_is_named():
     """Index 4, states of 0.5 and 1.3 beside 2e10, off by 0.2 and 0.01: the estimate was 2e-16."""
-    number = list(FAMILIES).index("growing")
-    case = FAMILIES["growing"](np.random.default_rng([number, 78]))
+    case = case_of("growing", 78)
     assert measure(case).ratio < 10.0
     found = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings(tol=1e-11))
     assert found.vague[1]

@@ -257,6 +257,13 @@ def test_knowledge_of_what_has_decayed_is_bounded():
     )
 
 
+def with_a_reset_to_the_same():
+    """A regression, and the same with T = I, τ = 0 on the way."""
+    plain = make_regression(three, ETA)
+    resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
+    return plain, type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+
+
 def test_windows_of_excitation_run_through_resets():
     """Behind each reset to η₊ = Tη a level is that of the plain regression's T⁻ᵀGT⁻¹."""
     plain = make_regression(three, ETA)
@@ -309,10 +316,8 @@ def test_an_unknown_whose_value_nobody_knows_spoils_no_other():
     "name", ["drem", "mre", "lion", "gradient", "least_squares", "ls_drem", "fct", "power"]
 )
 def test_a_reset_to_the_same_parameters_changes_nothing(name):
-    """T = I, τ = 0: every estimator goes on where it was, but for its prior."""
-    plain = make_regression(three, ETA)
-    resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
-    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+    """Every estimator goes on where it was, but for its prior."""
+    plain, cut = with_a_reset_to_the_same()
     estimator = estimators.build({"name": name})
     t = np.linspace(0.0, 10.0, 41)
     expected = estimators.estimate(estimator, plain, t).parameters(slice(None))
@@ -326,9 +331,7 @@ def test_a_reset_to_the_same_parameters_changes_nothing(name):
     [{"beta": 0.3}, {"beta": 0.3, "f0": 0.01, "bound": 1e3}, {"beta": 0.0}],
 )
 def test_memory_is_carried_through_a_reset(settings_of_estimator):
-    plain = make_regression(three, ETA)
-    resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
-    cut = type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+    plain, cut = with_a_reset_to_the_same()
     estimator = estimators.build({"name": "least_squares", **settings_of_estimator})
     t = np.array([0.0, 10.0])
     expected = estimators.estimate(estimator, plain, t).reached[0]

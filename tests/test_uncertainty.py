@@ -491,12 +491,17 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
 
 
+def noisy_battery():
+    """A recording of 101 rows."""
+    made = run("battery", observer="none", time={"horizon": 200.0, "samples": 101})
+    noisy = made["v"] + 0.002 * np.random.default_rng(0).standard_normal(101)
+    return {"t": made.t, "current": made["current"], "v": noisy}
+
+
 @pytest.mark.parametrize("sample_time", [None, 2.0])
 def test_estimates_that_noise_did_not_bring_where_they_are_have_no_deviations(sample_time):
     """Of an error of a third deviations of 1e-4 would be all that is said."""
-    made = run("battery", observer="none", time={"horizon": 200.0, "samples": 101})
-    noisy = made["v"] + 0.002 * np.random.default_rng(0).standard_normal(101)
-    data = {"t": made.t, "current": made["current"], "v": noisy}
+    data = noisy_battery()
     for name, known in (("gradient", False), ("least_squares", True)):
         found = run("battery", data=data, estimator=name, observer={"sample_time": sample_time})
         assert (found.details.estimation.parameters_std is not None) == known
@@ -506,22 +511,18 @@ def test_estimates_that_noise_did_not_bring_where_they_are_have_no_deviations(sa
 @pytest.mark.parametrize("name", ["gradient", "drem", "least_squares"])
 def test_a_stream_says_deviations_where_a_run_at_samples_does(name):
     """Not while what the estimator needs is not met and it is far from least squares so far."""
-    made = run("battery", observer="none", time={"horizon": 200.0, "samples": 101})
-    noisy = made["v"] + 0.002 * np.random.default_rng(0).standard_normal(101)
-    noise = {"name": "gaussian", "outputs": 0.002}
+    data, noise = noisy_battery(), {"name": "gaussian", "outputs": 0.002}
     found = run(
-        "battery", data={"t": made.t, "current": made["current"], "v": noisy}, estimator=name,
-        observer={"sample_time": 2.0, "hold": "linear"}, noise=noise,
+        "battery", data=data, estimator=name, observer={"sample_time": 2.0, "hold": "linear"},
+        noise=noise,
     ).details
     settings = Settings(
         estimator={"name": name}, data=DataSettings("csv", "-", "linear"),
         time=TimeSettings(-np.inf, np.inf, 11), noise=NoiseSettings(**noise),
     )
-    online = stream(settings, found.system)(0.0, np.array([made["current"][0], noisy[0]]))
-    parts = [
-        online.feed(made.t[part], made["current"][part, None], noisy[part, None])
-        for part in (slice(7), slice(7, 101))
-    ]
+    t, current, v = data["t"], data["current"][:, None], data["v"][:, None]
+    online = stream(settings, found.system)(0.0, np.append(current[0], v[0]))
+    parts = [online.feed(t[part], current[part], v[part]) for part in (slice(7), slice(7, 101))]
     std = np.concatenate([np.where(m.by_noise[..., None], m.std, np.nan)[0] for m in parts])
     assert np.isnan(std[0]).all()
     if name == "gradient":

@@ -85,6 +85,7 @@ class Assembled:
         return np.where(self.column_scale > 0.0, self.column_scale, 1.0)
 
     def _through(self, rounding: Array) -> Array:
+        """What ``rounding`` (n, n) of w leaves of each state (n,), with columns of size 1."""
         return np.asarray((rounding @ (self.moving / self._columns)).max(axis=1, initial=0.0))
 
     def lost(self, rounding: Array) -> float:
