@@ -17,6 +17,10 @@ class GpeboError(Exception):
 
     exit_code = 1
 
+    def __init__(self, message: str) -> None:
+        """Of ``message`` only what prints: names in a file of somebody else command no terminal."""
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
+
 
 class ConfigError(GpeboError):
     """Wrong usage or configuration: unknown key, wrong type or shape, hostile text (exit 2)."""

@@ -44,10 +44,7 @@ def nearest(given: str, known: Iterable[str]) -> str:
     """
     folded = {name.casefold(): name for name in reversed(list(known))}  # a for A is the nearest
     near = difflib.get_close_matches(given[:_SHOWN].casefold(), folded, 1, cutoff=0.5)
-    if not near:
-        return ""
-    name = folded[near[0]]  # perhaps of a file that somebody else wrote
-    return f"; did you mean {name if name.isprintable() else shown(name)}?"
+    return f"; did you mean {folded[near[0]]}?" if near else ""
 
 
 def unknown(what: str, given: object, known: Iterable[str], there: str = "known:") -> ConfigError:

@@ -273,6 +273,7 @@ def test_what_continues_and_what_is_a_comment():
     (".include /etc/passwd\nR1 a 0 1", "would read another file"),
     ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u)\nR1 a 0 1", "needs the number of pulses"),
     ("K1 L1 L2 0.5\nL1 a 0 1\nR2 b 0 1", "K1 couples l2, which is no inductor"),
+    ("K1 L1 L2\x1b[31m 0.5\nL1 a 0 1", r"K1 couples l2\x1b[31m, which is no inductor"),
     ("L1 a 0 1\nL2 b 0 1\nK1 L1 L2 1.5", "a coupling is at most 1"),
     ("R1 a 0 {1", "is not closed"),
     (".subckt s a\nR1 a 0 1\nX1 a s\n.ends\nX1 b s\nR2 b 0 1", "nested more than 20 deep"),

@@ -205,7 +205,7 @@ BAD = {
     "nan": ("t,V,y\n0,1,2\n1,nan,3\n", ["line 3", "column V", "'nan'", "finite"]),
     "inf": ("t,V,y\n0,1,2\n1,1,-inf\n", ["line 3", "column y", "finite"]),
     "text": ("t,V,y\n0,1,2\n1,off,3\n", ["line 3", "column V", "'off'", "not a number"]),
-    "a name over two lines": ("t,V,y\x85y\n0,1,2\n", ["line 1", "no column y", r"mean 'y\x85y'?"]),
+    "a name over two lines": ("t,V,y\x85y\n0,1,2\n", ["line 1", "no column y", r"mean y\x85y?"]),
     "a short row": ("t,V,y\n0,1,2\n1,2\n", ["line 3", "2 cells", "header has 3"]),
     "a long row": ("t,V,y\n0,1,2,3\n", ["line 2", "4 cells", "header has 3"]),
     "an empty line": ("t,V,y\n0,1,2\n\n1,1,3\n", ["line 3", "is empty"]),
