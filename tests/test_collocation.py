@@ -11,7 +11,14 @@ from scipy.linalg import expm
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.errors import judged_errors
-from gpebo_cli.numerics.mesh import Looked, Mesh, Trajectory, initial_mesh, unresolved
+from gpebo_cli.numerics.mesh import (
+    Looked,
+    Mesh,
+    Trajectory,
+    equal_lengths,
+    initial_mesh,
+    unresolved,
+)
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
@@ -135,6 +142,17 @@ def test_a_solution_that_overflows_is_an_error():
 
 def smooth_signal(mesh: Mesh) -> Trajectory:
     return Trajectory(mesh, np.stack([np.sin(mesh.points), mesh.points**3], axis=-1))
+
+
+def test_short_elements_are_not_of_one_length():
+    """All that were below 1e-11 of the longest one had their mean."""
+    rng = np.random.default_rng(3)
+    short = 10.0 ** rng.uniform(-12, -10, 60)
+    h = rng.permutation(np.concatenate([short, np.full(40, 0.25)]))
+    mesh = Mesh(np.concatenate([[0.0], np.cumsum(h)]), radau_rule(3))
+    group, mean = equal_lengths(mesh.steps, mesh)
+    np.testing.assert_allclose(mean, mesh.steps, rtol=0, atol=4e-15 * h.sum())
+    assert len(set(group[mesh.steps > 0.1])) == 1
 
 
 def test_trajectory_samples_integrates_and_filters():

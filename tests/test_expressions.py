@@ -165,6 +165,24 @@ def test_min_and_max_take_the_side_that_is_asked_for(order: int) -> None:
     np.testing.assert_array_equal(values[0, :2, :2], 1.0)
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_roots_of_max_are_numbers_where_its_sides_meet(compiled: bool) -> None:
+    """Rounding of the side that is asked for may be negative; what stays zero has derivatives."""
+    texts = ["sqrt(max(sin(w*t), 0))", "max(sin(w*t), 0)**1.2", "sqrt(0.3 - min(0.3, cos(w*t)))"]
+    tape = record([read(text.replace("w", w)) for text in texts for w in ("1.3", "3.7", "7.1")])
+    t = np.repeat(breakpoints(tape, 0.0, 20.0), 2)
+    evaluate = tape.taylor if compiled else tape.interpreted
+    inside = t + np.tile([-1e-3, 1e-3], len(t) // 2)
+    values = evaluate(t, 0, inside, None)[0]
+    wave = np.array([1.3, 3.7, 7.1]) * t[:, None]
+    exact = np.maximum(np.sin(wave), 0.0)
+    other = np.maximum(0.3 - np.cos(wave), 0.0)
+    exact = np.hstack([np.sqrt(exact), exact**1.2, np.sqrt(other)])
+    np.testing.assert_allclose(values, exact, atol=1e-6)
+    flat = evaluate(np.full(3, 4.6), 4, None, None)[:, :, [0, 3]]  # sin(1.3 t) < 0
+    np.testing.assert_array_equal(flat, 0.0)
+
+
 def test_min_and_max_are_one_of_the_two_to_the_last_bit() -> None:
     t = np.linspace(-3, 3, 1001)
     low, high, a, b = taylor(

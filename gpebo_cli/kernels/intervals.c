@@ -109,6 +109,7 @@ static inline Interval image(npy_intp what, Interval a, Interval b, int same_row
     case SUBTRACT: return widened(a.low - b.high, a.high - b.low);
     case MULTIPLY: return same_row ? square(a) : product(a, b);
     case DIVIDE: return quotient(a, b);
+    case MAXIMUM: return (Interval){greater(a.low, b.low), greater(a.high, b.high)};
     case POWER: return raised(a, b.low);
     case GREATER_EQUAL: return (Interval){a.low >= b.low, a.high >= b.low};
     case NEGATIVE: return (Interval){-a.high, -a.low};

@@ -24,24 +24,26 @@ static inline const double *row_of(const Rows *rows, npy_intp index)
     return index < GIVEN ? rows->given[index] : rows->signals + (index - GIVEN) * rows->stride;
 }
 
-/* z = x `op` y over a block, where either operand may be a constant. */
-#define BINARY(op)                                                                                 \
+/* z = a value of p and q over a block, where either operand may be a constant. */
+#define OF_BOTH(first, second, value)                                                              \
+    for (npy_intp i = 0; i < count; i++) {                                                         \
+        const double p = first, q = second;                                                        \
+        z[i] = value;                                                                              \
+    }
+#define BINARY(value)                                                                              \
     do {                                                                                           \
         if (left < 0) {                                                                            \
             const double a = rows->constants[~left];                                               \
             const double *restrict y = row_of(rows, right);                                        \
-            for (npy_intp i = 0; i < count; i++)                                                   \
-                z[i] = a op y[i];                                                                  \
+            OF_BOTH(a, y[i], value)                                                                \
         } else if (right < 0) {                                                                    \
             const double b = rows->constants[~right];                                              \
             const double *restrict x = row_of(rows, left);                                         \
-            for (npy_intp i = 0; i < count; i++)                                                   \
-                z[i] = x[i] op b;                                                                  \
+            OF_BOTH(x[i], b, value)                                                                \
         } else {                                                                                   \
             const double *restrict x = row_of(rows, left);                                         \
             const double *restrict y = row_of(rows, right);                                        \
-            for (npy_intp i = 0; i < count; i++)                                                   \
-                z[i] = x[i] op y[i];                                                               \
+            OF_BOTH(x[i], y[i], value)                                                             \
         }                                                                                          \
     } while (0)
 
@@ -60,10 +62,11 @@ EVERY_WIDTH static void operate(const Rows *rows, const Operation *operation, do
 {
     const npy_intp left = operation->left, right = operation->right;
     switch (operation->what) {
-    case ADD: BINARY(+); break;
-    case SUBTRACT: BINARY(-); break;
-    case MULTIPLY: BINARY(*); break;
-    case DIVIDE: BINARY(/); break;
+    case ADD: BINARY(p + q); break;
+    case SUBTRACT: BINARY(p - q); break;
+    case MULTIPLY: BINARY(p * q); break;
+    case DIVIDE: BINARY(p / q); break;
+    case MAXIMUM: BINARY(p > q ? p : q); break;
     case POWER: UNARY(pow(x[i], rows->constants[~right])); break;
     case GREATER_EQUAL: UNARY(x[i] >= rows->constants[~right] ? 1.0 : 0.0); break;
     case NEGATIVE: UNARY(-x[i]); break;

@@ -7,7 +7,7 @@
 #define GIVEN 2 /* rows that are always given: t, inside; those of signals follow */
 
 /* In the order of _OPERATIONS in expressions/program.py. */
-enum { ADD, SUBTRACT, MULTIPLY, DIVIDE, POWER, GREATER_EQUAL, BINARY_OPERATIONS };
+enum { ADD, SUBTRACT, MULTIPLY, DIVIDE, MAXIMUM, POWER, GREATER_EQUAL, BINARY_OPERATIONS };
 enum { NEGATIVE = BINARY_OPERATIONS, SQRT, EXP, LOG, SIN, COS, TAN, SINH, COSH, TANH, ASIN };
 enum { ACOS = ASIN + 1, ATAN, ASINH, ACOSH, ATANH, ERF, ABSOLUTE, SIGN, OPERATIONS };
 

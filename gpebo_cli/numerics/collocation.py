@@ -233,7 +233,7 @@ def _element_maps(
         c = known
         if c is None or len(h) > chunk:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
-        maps = _solve_elements(problem, mesh.rule, h[part], t[part], c)
+        maps = _solve_elements(problem, mesh, h[part], t[part], c)
         if len(h) <= chunk:
             return maps
         if not whole:
@@ -261,9 +261,9 @@ def at_points(values: Array, k: int, s: int) -> Array:
 
 
 def _solve_elements(
-    problem: LinearProblem, rule: RadauRule, h: Array, t: Array, c: LinearEquation
+    problem: LinearProblem, mesh: Mesh, h: Array, t: Array, c: LinearEquation
 ) -> _Maps:
-    k, s = len(h), rule.stages
+    k, s = len(h), mesh.rule.stages
     basis, offset = (None, None) if c.constraints is None else c.constraints
     group, groups = np.arange(k), k
     if c.E is not None and len(c.A) > 1 and not (some := c.E.any(axis=(0, 2))).all():
@@ -273,13 +273,13 @@ def _solve_elements(
         c = c._replace(A=c.A * weights, f=c.f * weights)
     solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c):
-        group, h = equal_lengths(h)
+        group, h = equal_lengths(h, mesh)
         groups = int(group.max(initial=-1)) + 1
         if s * c.A.shape[1] > _DIRECT:
             solve = partial(elements_numpy.element_maps, solve=solve_constant)
     try:
         homogeneous, particular = solve(
-            rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
+            mesh.rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
         )
     except np.linalg.LinAlgError as error:
         raise SolverError(

@@ -33,7 +33,8 @@ def by_elimination(
 
     That is not looked at with ``kicks``.
     """
-    h, D, (rows, columns, entries) = equal_lengths(mesh.steps)[1], mesh.rule.differentiation, A
+    _, h = equal_lengths(mesh.steps, mesh)
+    D, (rows, columns, entries) = mesh.rule.differentiation, A
     values = elements.stiff(
         D, h, *steps_of(rows.tobytes(), columns.tobytes()), entries, f, kicks, start
     )

@@ -28,7 +28,8 @@ _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 1 << 16  # numbers, from which on sampling them by element pays
 _SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
 _BLUR = 8.0 * np.finfo(float).eps
-_EQUAL = 1e-11  # relative difference of lengths that is rounding
+_EQUAL = 1e-11  # relative difference of lengths that is rounding,
+_ROUNDING = 8 * float(np.finfo(float).eps)  # if it is this of the span: short ones differ by more
 _TINY = float(np.finfo(np.float64).tiny)
 _WINDOW = 1 << 12  # elements of a long mesh that are solved together
 
@@ -284,7 +285,7 @@ class Trajectory:
         shape = self.values.shape[2:]
         rates = np.broadcast_to(np.asarray(rate, dtype=np.float64), shape).ravel()
         at_start = np.zeros(len(rates)) if start is None else start.ravel()
-        values, (group, steps) = _flat(self.values), equal_lengths(mesh.steps)
+        values, (group, steps) = _flat(self.values), equal_lengths(mesh.steps, mesh)
         filtered = np.empty(values.shape)
         for one in sorted({*rates.tolist()}):
             some = (rates == one).nonzero()[0]
@@ -319,18 +320,19 @@ def joined(pieces: Sequence[Trajectory]) -> Trajectory:
     return Trajectory(mesh, np.concatenate([piece.values for piece in pieces]))
 
 
-def equal_lengths(h: Array) -> tuple[IntArray, Array]:
-    """Group (K,) of each length, and the group's mean in its place.
+def equal_lengths(h: Array, mesh: Mesh) -> tuple[IntArray, Array]:
+    """Group (K,) of each length of a mesh's elements, and the group's mean in its place.
 
-    Lengths that differ by rounding only count as equal. One of them for all would be wrong each
-    time in the same direction, and over many elements that adds up; what their mean is wrong by
-    adds up to nothing. Groups are numbered as they first appear.
+    Lengths that differ by rounding of the mesh's edges only count as equal. One of them for all
+    would be wrong each time in the same direction, and over many elements that adds up; what their
+    mean is wrong by adds up to nothing. Groups are numbered as they first appear.
     """
     group = np.zeros(len(h), dtype=np.intp)
-    if h.max(initial=0.0) - h.min(initial=np.inf) > _EQUAL * h.max(initial=0.0):
+    same = min(_EQUAL * h.max(initial=0.0), _ROUNDING * float(mesh.edges[-1] - mesh.edges[0]))
+    if h.max(initial=0.0) - h.min(initial=np.inf) > same:
         order = h.argsort(kind="stable")
         ascending, longer = h[order], np.ones(len(h), dtype=bool)
-        longer[1:] = ascending[1:] - ascending[:-1] > _EQUAL * ascending[-1]
+        longer[1:] = ascending[1:] - ascending[:-1] > same
         first = np.minimum.reduceat(order, longer.nonzero()[0])
         group[order] = first.argsort().argsort()[longer.cumsum() - 1]
     return group, np.asarray((np.bincount(group, weights=h) / np.bincount(group))[group])

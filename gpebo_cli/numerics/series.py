@@ -309,7 +309,7 @@ def by_factors(A: Sparse) -> March:
         s, (d, columns) = mesh.rule.stages, start.shape
         from_left = mesh.rule.differentiation.sum(axis=1)[:, None, None]
         values, state = np.empty((mesh.size, s + 1, d, columns)), start
-        for k, step in enumerate(equal_lengths(mesh.steps)[1].tolist()):
+        for k, step in enumerate(equal_lengths(mesh.steps, mesh)[1].tolist()):
             right = np.broadcast_to(from_left / step * state, (s, d, columns)).copy()
             points = slice(k * (s + 1) + 1, (k + 1) * (s + 1))
             right[:, :, : f.shape[2]] += f if len(f) == 1 else f[points]

@@ -43,7 +43,7 @@ class Interval(NDArrayOperatorsMixin):
         """All values that a function can have."""
         with np.errstate(all="ignore"):
             low, high = _image(ufunc, *inputs)
-            if ufunc.__name__ in ("negative", "absolute", "sign", "greater_equal"):
+            if ufunc.__name__ in ("maximum", "negative", "absolute", "sign", "greater_equal"):
                 return Interval(low, high)
             slack = _WIDER * np.abs(low) + _TINY, _WIDER * np.abs(high) + _TINY
             return Interval(low - slack[0], high + slack[1])
@@ -128,6 +128,7 @@ _OTHERS: dict[str, Callable[..., Any]] = {
     "subtract": lambda low, high, least, most: (low - most, high - least),
     "multiply": _product,
     "divide": _quotient,
+    "maximum": lambda low, high, least, most: (np.maximum(low, least), np.maximum(high, most)),
     "negative": lambda low, high, *_: (-high, -low),
     "power": _power,
     "absolute": lambda low, high, *_: _even(np.absolute, low, high),

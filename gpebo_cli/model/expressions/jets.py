@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+_NOTHING = 1e-290  # less is a zero, also as a bound, which is widened by 2e-308
 MAX_MULTIPLIED_POWER = 1024  # larger integer exponents take the recurrence, which needs a != 0
 
 Coefficient = NDArray[np.float64] | float
@@ -81,13 +82,16 @@ def power(a: Jet, exponent: float, order: int) -> Jet:
         result = integer_power(a, abs(int(exponent)), order)
         return result if exponent > 0 else divide([1.0], result, order)
     p: Jet = [np.sqrt(a[0]) if exponent == 0.5 else np.power(a[0], exponent)]
-    if len(a) == 1:
+    if len(a) == 1 or order == 0:
         return p
+    # What stays zero has a root with all its derivatives, and they are not 0/0.
+    size = sum(np.absolute(each) for each in a)
+    flat = 1.0 - np.greater_equal(size, _NOTHING).astype(np.float64)
     for k in range(1, order + 1):
         total: Coefficient = 0.0
         for j in range(1, min(k, len(a) - 1) + 1):
             total = total + (j * exponent - (k - j)) * (a[j] * p[k - j])
-        p.append(np.divide(total, k * a[0]))
+        p.append(np.divide(total, k * a[0] + flat))
     return p
 
 
@@ -148,17 +152,22 @@ def erf(a: Jet, order: int) -> Jet:
 def switched(name: str, decided: Coefficient, arguments: list[Jet], order: int) -> Jet:
     """sign, abs, min or max, which of their sides being decided by the sign of ``decided``.
 
-    min and max are w a + (1 - w) b with w = 0 or 1: one of the two to the last bit.
+    Where the sides meet, rounding may have any sign, and a root of it would not be a number: values
+    of abs, min and max are those of the time itself.
     """
     sign = np.sign(decided)
     if name == "sign":
         return [sign]
-    if name == "abs":  # at its zero rounding has any sign: a root of it would not be a number
+    if name == "abs":
         value = arguments[0]
         return [np.absolute(value[0]), *multiply([sign], value, order)[1:]]
-    weight = 0.5 + (0.5 if name == "max" else -0.5) * sign
+    if name == "min":
+        opposite = [negative(each, order) for each in arguments]
+        return negative(switched("max", np.negative(decided), opposite, order), order)
     a, b, _ = arguments
-    return add(multiply([weight], a, order), multiply([1.0 - weight], b, order), order)
+    weight = 0.5 + 0.5 * sign
+    sides = multiply([weight], a, order), multiply([1.0 - weight], b, order)
+    return [np.maximum(a[0], b[0]), *add(*sides, order)[1:]]
 
 
 _WAVES = {"sin": np.sin, "cos": np.cos, "sinh": np.sinh, "cosh": np.cosh}

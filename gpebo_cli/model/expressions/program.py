@@ -20,9 +20,9 @@ from gpebo_cli.model.descriptor import Array, IntArray
 _OPERATIONS = {
     name: code
     for code, name in enumerate((
-        "add", "subtract", "multiply", "divide", "power", "greater_equal", "negative", "sqrt",
-        "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "arcsin", "arccos", "arctan",
-        "arcsinh", "arccosh", "arctanh", "erf", "absolute", "sign",
+        "add", "subtract", "multiply", "divide", "maximum", "power", "greater_equal", "negative",
+        "sqrt", "exp", "log", "sin", "cos", "tan", "sinh", "cosh", "tanh", "arcsin", "arccos",
+        "arctan", "arcsinh", "arccosh", "arctanh", "erf", "absolute", "sign",
     ))
 }  # fmt: skip
 _GIVEN = 2  # rows that are always given: the times, and those at which jumps are decided
