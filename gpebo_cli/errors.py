@@ -12,14 +12,18 @@ from collections.abc import Callable
 _MOST = 2.0  # GB
 
 
+def printable(text: str) -> str:
+    """The text on one line; what would command a terminal in it is written as it is in Python."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 class GpeboError(Exception):
     """A run or a check that failed for a reason its user can act on (exit code 1)."""
 
     exit_code = 1
 
     def __init__(self, message: str) -> None:
-        """Of ``message`` only what prints: names in a file of somebody else command no terminal."""
-        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in message))
+        super().__init__(printable(message))  # it may repeat names of somebody else's file
 
 
 class ConfigError(GpeboError):

@@ -658,14 +658,14 @@ def test_an_output_called_T_is_no_time(tmp_path):
 
 def test_what_is_guessed_runs_as_it_stands(tmp_path):
     columns = signals_of(simulated(samples=201))
-    lines = ["Time / ms;U (mV);I measured;note"]
+    lines = ["Time / ms;U (mV);I measured\x7f;\x1b[31mnote"]
     rows = zip(columns["t"], columns["V"], columns["y"], strict=True)
     for k, (t, V, y) in enumerate(rows):
         voltage = "" if k == 7 else f"{1e3 * V:.17g}"
         lines.append(f"{1e3 * t:.17g};{voltage};{y:.17g};".replace(".", ","))
     (tmp_path / "lab 1.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     said = printed(gpebo("new", "recording", "lab 1.csv", "--plant", "circuit", cwd=tmp_path))
-    assert "not understood: not read: note" in said
+    assert r"not understood: not read: \x1b[31mnote" in said
     assert "by elimination" in said
     words = ["plant=circuit", "data=lab_1", "estimator=ls_drem", "figures=none", "data.scale.y=1"]
     printed(gpebo("run", "--config-dir", ".", *words, "hydra.run.dir=out", cwd=tmp_path))

@@ -7,6 +7,7 @@ import sys
 
 from gpebo_cli.cli.options import CONFIG_DIR, parse
 from gpebo_cli.configs.locations import choices, conf_folder, outline
+from gpebo_cli.errors import printable
 
 KINDS = {
     "plants": "plant",
@@ -68,5 +69,4 @@ def _scalar(text: str) -> str:
         text = text.partition(" #")[0].rstrip()
     if text in ("null", "~"):
         return ""
-    # Titles come from other people's files: nothing that a terminal would obey.
-    return "".join(c if c.isprintable() else "?" for c in text)
+    return printable(text)  # titles come from other people's files

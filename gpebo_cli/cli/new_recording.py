@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gpebo_cli.configs import files
 from gpebo_cli.configs.locations import choices, conf_folder
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, printable
 from gpebo_cli.recordings.guess import Guess, guess
 from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.results.files import make_folder, write_text
@@ -41,7 +41,7 @@ def write(file: str, plant: str, folder: str) -> int:
     lines += [f"not understood: {doubt}" for doubt in found.doubts]
     run = f"gpebo run --config-dir {shlex.quote(folder)} plant={plant} data={name}"
     lines.append(f"look at the guesses in it, then: {run}")
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.write("".join(f"{printable(line)}\n" for line in lines))
     return 0
 
 
@@ -55,7 +55,7 @@ def text(file: str, plant: str, found: Guess) -> str:
     reasons = found.reasons
     head = [
         f"# How gpebo reads a recording of plant {plant}: guesses, made from its first rows.",
-        *(f"# NOT UNDERSTOOD: {' '.join(doubt.split())}" for doubt in found.doubts),
+        *(f"# NOT UNDERSTOOD: {doubt}" for doubt in found.doubts),
         line("name", "csv"),
         line("title", f"recording of {plant}, {os.path.basename(file)}"),
         line("file", os.path.abspath(file)),
@@ -75,4 +75,4 @@ def text(file: str, plant: str, found: Guess) -> str:
     head.append(line("gaps", found.gaps or None, reasons.get("gaps", "")))
     gaps = f"{found.missing} cells are empty; or hold, drop, refuse" if found.missing else ""
     head.append(line("missing", "interpolate" if found.missing else "refuse", gaps))
-    return "\n".join(head) + "\n"
+    return "".join(f"{printable(line)}\n" for line in head)
