@@ -358,6 +358,25 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(monk
     assert asked[1][1] < 0.1 * SOLVER.max_elements
 
 
+@pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])
+def test_with_a_remedy_too_the_other_form_is_taken_where_one_is_not_resolved(monkeypatch, remedy):
+    given = gpebo.reduced_system
+
+    def lost(system, signals, solver, *, form, **settings):
+        if form in refused:
+            raise SolverError(f"rounding of {form}")
+        return given(system, signals, solver, form=form, **settings)
+
+    monkeypatch.setattr(gpebo, "reduced_system", lost)
+    observer = {"name": "gpebo", "remedy": remedy}
+    refused = {"auto"}
+    result = run("descriptor", observer=observer, estimator="least_squares", time={"horizon": 5})
+    assert "strangeness-free form, for as given its signals are not" in result.details.verdict
+    refused = {"auto", "strangeness_free"}
+    with pytest.raises(SolverError, match="rounding of auto"):
+        run("descriptor", observer=observer, estimator="least_squares", time={"horizon": 5})
+
+
 def test_feedthrough_bias_of_a_sensor_and_a_known_term():
     plant = {
         "name": "biased", "states": ["x", "z"], "inputs": {"u": "sin(t) + cos(3*t)"},

@@ -547,3 +547,10 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
 def test_command_refuses_in_one_line(words, message, tmp_path):
     done = gpebo("run", "plant=circuit", "figures=none", *words, cwd=tmp_path)
     assert_refused(done, message)
+
+
+def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):
+    """It named settings of the Kalman-Bucy filter."""
+    monkeypatch.setattr("gpebo_cli.observers._riccati._FALL", 0.0)
+    with pytest.raises(SolverError, match=r"a double; give the gain, observer\.injection, or"):
+        run(GROWING, 1.0, remedy="output_injection")

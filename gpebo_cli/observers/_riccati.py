@@ -41,6 +41,7 @@ _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each in its unit (see _units), are
 # resolved less: P as a matrix does not hold them, for its rounding is that of its largest entry.
 _SMALLEST = 3e-5
+_ADVICE = "lower observer.P0, or raise observer.regularisation or the noise"
 _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
 _UNSEEN = 1e-12  # of P, by which measurements change it over the horizon: as much as none
 _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
@@ -142,7 +143,7 @@ def run_filter(
     model: Model, start: Array, P0: Array, mesh: Mesh, *, tol: float, max_elements: int,
     monitor: Monitor | None = None, name: str = "Kalman-Bucy filter",
     floor: Array | float = 0.0, sizes: Array | float = 1.0, horizon: float | None = None,
-    before: Filtered | None = None,
+    before: Filtered | None = None, advice: str = _ADVICE,
 ) -> Filtered:
     """Solve Riccati equation and filter on ``mesh``, refined until P and ζ̂ are resolved.
 
@@ -156,7 +157,7 @@ def run_filter(
     if before is None:
         m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
         horizon = horizon or float(mesh.edges[-1] - mesh.edges[0])
-        unit, variance, tol = _scaled(m, P0, horizon, sizes, tol, name)
+        unit, variance, tol = _scaled(m, P0, horizon, sizes, tol, name, advice)
         first = pair(P0 / (variance * np.outer(unit, unit)), start / unit[:, None])
     else:
         unit, variance, tol = before.unit, before.variance, before.tol
@@ -230,7 +231,8 @@ def run_filter(
 
 
 def _scaled(
-    m: StateSpace, P0: Array, horizon: float, sizes: Array | float, tol: float, name: str
+    m: StateSpace, P0: Array, horizon: float, sizes: Array | float, tol: float, name: str,
+    advice: str,
 ) -> tuple[Array, float, float]:
     """Units (n,) of ζ, a factor of all covariances, and the tolerance that rounding leaves."""
     deviation = np.sqrt(np.diag(P0))
@@ -244,8 +246,7 @@ def _scaled(
     if fall > _FALL:
         raise SolverError(
             f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
-            "the digits of a double; lower observer.P0, or raise observer.regularisation or the "
-            "noise"
+            f"the digits of a double; {advice}"
         )
     # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
     return unit, variance, max(tol, _LEFT * float(np.finfo(float).eps) * fall)

@@ -102,8 +102,9 @@ class Gpebo:
     ) -> Observation:
         """:meth:`observe` along the signals as they are given."""
         arguments = system, signals, solver
-        if self.form != "auto" or self.regression == "paper" or not isinstance(self.remedy, Plain):
+        if self.form != "auto" or self.regression == "paper":
             return self._on(self.form, *arguments)
+        plain = isinstance(self.remedy, Plain)
         found: Observation | ModelError | SolverError
         known = everything = (True, system.q + system.n)
 
@@ -113,6 +114,8 @@ class Gpebo:
         # No mesh resolves Assumption 1 failing at one time, or the other form's large rounding; or
         # it is only when elements are cut that such a time is met.
         try:
+            if not plain:
+                return self._on("auto", *arguments)
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
             short = signals.mesh.size < _LONG
             if short and not found.note and not _same_on_both_forms(found, system, signals):
@@ -128,7 +131,7 @@ class Gpebo:
                 limits = few(4 * found.regression.mesh.size)
             try:
                 other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
-                if _told(other, system, solver) > known:
+                if not plain or _told(other, system, solver) > known:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass

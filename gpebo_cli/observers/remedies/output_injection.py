@@ -127,6 +127,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         model, np.zeros((n, 0)), (inward * sizes) @ inward.T, reduced.mesh.windows(),
         tol=_TOLERANCE, max_elements=reduced.solver.max_elements,
         name=f"output injection for plant {reduced.system.name}", sizes=units,
+        advice="give the gain, observer.injection, or choose another remedy",
     )
     S = joined([_covariance(part, reduced.mesh.rule) for part in parts])
 
