@@ -118,9 +118,15 @@ def test_every_file_of_a_group_has_a_title():
             assert yaml.safe_load(path.read_text())["title"], path
 
 
-def test_a_title_cannot_command_the_terminal(tmp_path, mine):
+def test_a_title_or_a_result_cannot_command_the_terminal(tmp_path, mine):
     (mine / "plant" / "evil.yaml").write_text("title: a\x1b[31mb\n")
-    assert "\x1b" not in gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path).stdout
+    assert r"a\x1b[31mb" in printed(gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path))
+    for name in ("one", "two"):
+        printed(gpebo("run", *FAST, f"hydra.run.dir={name}", cwd=tmp_path))
+    summary = tmp_path / "two" / "summary.json"
+    summary.write_text(summary.read_text().replace('"plant": "', r'"plant": "\u001b[31m'))
+    said = printed(gpebo("compare", "one", "two", "--no-figures", cwd=tmp_path))
+    assert r"\x1b[31mcircuit" in said
 
 
 # Errors: one line, its exit code, a suggestion ----------------------------------------------

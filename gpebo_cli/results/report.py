@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gpebo_cli.errors import printable
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.names import SETTLED, known_by, shown_metrics
 from gpebo_cli.results.symbols import number_text, symbol
@@ -147,7 +148,8 @@ def estimate_table(result: RunResult) -> list[str]:
 def columns(
     rows: Sequence[Sequence[str]], aligned: Callable[[str, int], str] = str.rjust
 ) -> list[str]:
-    """Rows of text as lines with aligned columns."""
+    """Rows of text, perhaps of other people's files, as lines with aligned columns."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(map(aligned, row, widths)) for row in rows]
 
