@@ -261,15 +261,25 @@ def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
     assert np.mean([_varies_slowly(e + wave) for e in white]) > 0.9
 
 
-def test_noise_in_the_matrices_is_named():
-    """The motor's currents stand in A and F: the plant is right, and the residual is not white."""
-    made = run("motor", observer="none", time={"horizon": 0.2, "samples": 201})
-    data = {"t": made.t, "vd": made["vd"], "vq": made["vq"]}
-    rng = np.random.default_rng(0)
-    data |= {name: made[name] + 0.02 * rng.standard_normal(201) for name in ("yd", "yq")}
-    said = run("motor", data=data, estimator="least_squares").verdict
-    assert "is not white" in said
-    assert "which noise of yd, yq in the matrices does; or it suggests" in said
+def test_noise_in_the_matrices_is_named_and_may_be_taken_out():
+    """The output stands in A: the plant is right, and the residual is not white.
+
+    Along a copy without noise it is, and there are deviations; and a plant that is wrong is told.
+    """
+    made = run("duffing", observer="none", time={"horizon": 15.0, "samples": 601})
+    noise = 0.05 * np.random.default_rng(0).standard_normal(601)
+    data = {"t": made.t, **made.inputs, "position": made["position"] + noise}
+    plain = run("duffing", data=data, estimator="least_squares").verdict
+    assert "is not white" in plain
+    assert "which noise of position in the matrices does (observer.remedy=noise_free takes" in plain
+    given = {"data": data, "estimator": "least_squares", "observer": {"remedy": "noise_free"}}
+    clean = run("duffing", **given)
+    assert "explain the data up to white noise" in clean.verdict
+    e = clean.details.estimation
+    assert (np.abs(e.parameters[0, -1, :2] - [-1, 1]) < 3.0 * e.parameters_std[0, -1, :2]).all()
+    wrong = run(shipped("duffing", A=[[0, 1], [0, -0.2]]), **given).verdict  # damping is 0.3
+    assert "is not white" in wrong
+    assert "in the matrices" not in wrong
 
 
 def test_an_output_that_is_used_up_for_a_state_is_no_residual():

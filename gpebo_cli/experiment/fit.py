@@ -129,6 +129,8 @@ def _explained(
             ) if own < _ROUNDING * step
         ],
         correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
-        in_matrices=tuple(name for name in system.outputs if name in names),
+        in_matrices=tuple(
+            name for name in system.outputs if name in names and observation.errors is None
+        ),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -23,8 +23,8 @@ _MANY = f"each of {{}} cases would take a pass of its own, which up to {MOST_CAS
 _FEW = "the samples are so few that the estimates leave nothing of them to tell their noise"
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
 _IN_MATRICES = (
-    "noise of the signals is in the matrices or differentiated, or this remedy cannot tell what it "
-    "does"
+    "noise of the signals is in the matrices (of outputs observer.remedy=noise_free takes it out) "
+    "or differentiated, or this remedy cannot tell what it does"
 )
 
 

@@ -19,6 +19,7 @@ _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
+_TAKEN_OUT = "observer.remedy=noise_free takes it out"
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
 
@@ -107,7 +108,8 @@ def _explains(fit: Fit, case: int) -> str:
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}), which "
-        f"{f'noise of {names} in the matrices does; or it ' if names else ''}suggests {why}"
+        f"{f'noise of {names} in the matrices does ({_TAKEN_OUT}); or it ' if names else ''}"
+        f"suggests {why}"
     )
 
 
