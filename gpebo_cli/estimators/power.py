@@ -34,6 +34,7 @@ _TOLERANCE, _ROUNDING = 1e-11, 1e-15
 _INSIDE = 1e-3  # of a step: which element a node belongs to
 _ITERATIONS = 12  # of Newton's method
 _NOTHING = 1e-290  # next to the smallest number
+_STRETCH = 2048  # elements whose signals are held
 _SHORTEST = 1e-11  # steps, relative to the element
 
 
@@ -119,29 +120,37 @@ class PowerEstimates(MixedEstimates):
         out = np.empty((len(eta), len(path.t)))
         out[:, : np.searchsorted(path.t, path.mesh.edges[0], side="right")] = eta[:, None]
         step = np.ones(len(eta))  # of the element, as it turned out to be good
-        for left, right in pairwise(path.mesh.edges.tolist()):
+        edges = path.mesh.edges
+        for k, (left, right) in enumerate(pairwise(edges.tolist())):
+            if k % _STRETCH == 0:  # of whole elements, many at once
+                ahead = edges[k : k + _STRETCH + 1]
+                whole = _signals(path, ahead[:-1], ahead[1:])
             at = np.zeros(len(eta))  # share of the element that is done
             wanted = np.flatnonzero((path.t > left) & (path.t <= right))
             places = (path.t[wanted] - left) / (right - left)
             while (lanes := np.flatnonzero(at < 1.0)).size:
                 end = at[lanes] + step[lanes]
                 end = np.where(end > 1.0 - 1e-9, 1.0, end)
-                from_, to = (left + (right - left) * share for share in (at[lanes], end))
-                pairs, of = np.unique(np.stack([from_, to]), axis=1, return_inverse=True)
-                delta, Y, digits = (x[of] for x in _signals(path, *pairs))
+                if (end - at[lanes] == 1.0).all():
+                    signals, of = whole, np.full(len(lanes), k % _STRETCH)
+                else:
+                    shares = left + (right - left) * np.stack([at[lanes], end])
+                    pairs, of = np.unique(shares, axis=1, return_inverse=True)
+                    signals = _signals(path, *pairs)
+                delta, Y, digits = (x[of] for x in signals)
                 Y = Y[np.arange(len(lanes)), :, column[lanes]]
-                values, good = self._step(
-                    path, to - from_, eta[lanes], gamma[lanes], delta, Y, digits
-                )
+                h = (right - left) * (end - at[lanes])
+                values, good = self._step(path, h, eta[lanes], gamma[lanes], delta, Y, digits)
                 step[lanes] *= np.where(good, np.where(step[lanes] < 1.0, 2.0, 1.0), 0.25)
                 if step.min() < _SHORTEST:
                     raise SolverError(f"the power law is not resolved near t = {left:.6g}")
-                lane, k = np.nonzero(
-                    good[:, None] & (places > at[lanes, None]) & (places <= end[:, None])
-                )
-                share = (places[k] - at[lanes][lane]) / (end - at[lanes])[lane]
-                weights = path.mesh.rule.interpolation(share)
-                out[lanes[lane], wanted[k]] = np.einsum("ni,ni->n", weights, values[lane])
+                if len(wanted):
+                    lane, j = np.nonzero(
+                        good[:, None] & (places > at[lanes, None]) & (places <= end[:, None])
+                    )
+                    share = (places[j] - at[lanes][lane]) / (end - at[lanes])[lane]
+                    weights = path.mesh.rule.interpolation(share)
+                    out[lanes[lane], wanted[j]] = np.einsum("ni,ni->n", weights, values[lane])
                 eta[lanes] = np.where(good, values[:, -1], eta[lanes])
                 at[lanes] = np.where(good, end, at[lanes])
         return np.moveaxis(out.reshape(*shape, -1), 1, 2)
@@ -166,12 +175,14 @@ class PowerEstimates(MixedEstimates):
         scale = np.maximum(np.abs(eta), max(np.abs(path.quotient[-1]).max(), path.floor, 1e-300))
         for _ in range(_ITERATIONS):
             size = np.abs(w)
-            speed = gamma[:, None] * w + self.gamma2 * np.sign(w) * size**ratio
+            speed, slope = gamma[:, None] * w, gamma[:, None]
+            if self.gamma2:
+                speed = speed + self.gamma2 * np.sign(w) * size**ratio
+                slope = slope + self.gamma2 * ratio * size ** (ratio - 1.0)
             moved = (integral @ speed[..., None])[..., 0]
             change = np.abs(moved - before).max(axis=1) / scale
             if (change < 1e-3 * _TOLERANCE).all():
                 break
-            slope = gamma[:, None] + self.gamma2 * ratio * size ** (ratio - 1.0)
             J = coupling * slope[:, None]
             J[:, diagonal, diagonal] += np.where(delta, root * size ** (root - 1.0), 1.0)
             # Where nothing is left of Δ and r nothing moves.
