@@ -97,7 +97,6 @@ def test_of_what_remedies_choose(remedy, plant):
     "annihilator",
 ])
 def test_of_any_estimator(name):
-    """With a gain that is given; without one ls_drem takes what all data need."""
     one, other = (
         run("circuit", estimator={"name": name, "gamma": 1e3},
             time={"horizon": count * STEP, "samples": count + 1}).details.estimation
@@ -112,6 +111,23 @@ def test_of_the_kalman_bucy_filter(plant):
     """Without noise, where measurements are exact, and what regularises them is its own."""
     one, other = (run_to(plant, count, observer="kalman_bucy") for count in (20, 64))
     assert_same_past(one, other)
+
+
+@pytest.mark.parametrize("name", ["ls_drem", "least_squares"])
+@pytest.mark.parametrize("plant", ["circuit", "boost", "lorenz", "window", 2, 4])
+def test_of_the_defaults(plant, name):
+    """No gain is given, and none is taken from what comes later."""
+    plant = random_system(plant)[0] if isinstance(plant, int) else plant
+    one, other = (
+        run(plant, estimator=name, time={"horizon": count * STEP, "samples": count + 1}).details
+        for count in (20, 40)
+    )
+    since = [other.estimable[state] for state in other.system.states]
+    known = one.estimation.t[:-1, None] >= np.array([np.inf if s is None else s for s in since])
+    a, b = one.estimation.states[0, :-1], other.estimation.states[0, :20]
+    away = np.where(known, np.abs(b - a) / np.nanmax(np.abs(b), axis=0), 0.0)
+    assert away[10:].max() < (1e-8 if name == "ls_drem" else 1e-4)
+    assert away.max() < (1e-8 if name == "ls_drem" else 1e-3)
 
 
 def test_with_bounds():

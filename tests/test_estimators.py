@@ -23,8 +23,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem
-from gpebo_cli.experiment.pipeline import run_experiment, stream, stream_verdict
-from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics
@@ -735,18 +734,36 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
 
 
-@pytest.mark.parametrize(("slower", "expected"), [(1.0, 10.0), (1e-3, 10.0 * np.log(100.0))])
-def test_a_gain_that_nobody_set_is_raised_where_it_is_too_small(slower, expected):
-    """Δ is nearly one: γ∫Δ² = γ T, and what it needs is ln 100, whatever the unit of time."""
-    horizon = 20.0 * slower
-    system = plant_from_mapping(one_state(unknowns={"a": 2}, F=[["1e6"]], C=[["1e6"]]))
-    found = run_experiment(Settings(
-        estimator={"name": "ls_drem"}, time=TimeSettings(horizon=horizon, samples=11)
-    ), system).estimation
-    least = expected / horizon if slower < 1.0 else expected
-    assert found.cases[0]["gamma"] == pytest.approx(least, rel=0.05)
-    assert found.requirement.holds
-    np.testing.assert_allclose(found.parameters[0, -1, 0], 2.0, rtol=1e-9)
+@pytest.mark.parametrize("beta", [0.0, 0.4])
+def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta):
+    """Of Y = 2 + sin(t) and ψ = 1: T η̂' = 50 (x/T − η̂), where x' = Y − βx is the memory."""
+    T = np.linspace(0.5, 6.0, 12)
+    signal = regression(lambda t: np.ones((*t.shape, 1)), np.array([2.0]), 6.0, disturbance=np.sin)
+    found = estimate("ls_drem", signal, T, beta=beta).parameters(slice(None))[0, :, 0]
+
+    def rates(t, x):
+        memory = -np.expm1(-beta * t) / beta if beta else t
+        return [2.0 + np.sin(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
+
+    exact = integrate(rates, [2e-3, 2.0], np.append(1e-3, T))[1:, 1]
+    np.testing.assert_allclose(found, exact, rtol=1e-6)
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])
+@pytest.mark.parametrize("name", ["ls_drem", "least_squares"])
+def test_defaults_know_no_units(name, observer):
+    """The same plant in milliseconds and tiny units has the same estimates, which are right."""
+    def found(time, size):
+        plant = one_state(unknowns={"a": 2}, E=[[time]], A=[[-1]], F=[[size]], initial_state=[size])
+        own = observer | {"sample_time": 0.05 * time} if observer else {}
+        return gpebo_cli.run(plant, estimator=name, observer={"name": "gpebo"} | own,
+                             time={"horizon": 5 * time, "samples": 51})
+
+    one, other = found(1.0, 1.0), found(1e-3, 1e-5)
+    assert one.details.estimation.requirement.holds
+    assert other.details.estimation.requirement.holds
+    np.testing.assert_allclose(other.estimates["a"], one.estimates["a"], rtol=1e-9)
+    np.testing.assert_allclose(one.estimates["a"][0, -1], 2.0, rtol=2e-3 if observer else 1e-9)
 
 
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])
@@ -852,7 +869,8 @@ def test_defaults_from_python_are_those_of_the_files(group, path):
 
 def test_what_fct_hands_on_is_declared_as_where_it_goes():
     own = {each.name: each for each in fields(FiniteTime)}
-    for inner, other in ((Drem, set()), (LsDrem, {"gamma"})):  # γ of ls_drem is another number
+    # Those of ls_drem may be relative.
+    for inner, other in ((Drem, set()), (LsDrem, {"gamma", "f0"})):
         for each in fields(inner):
             if each.name not in other:
                 mine = own[each.name]

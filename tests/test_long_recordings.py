@@ -77,7 +77,7 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
 
 
 @pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])
-@pytest.mark.parametrize("estimator", ["mre", "least_squares"])
+@pytest.mark.parametrize("estimator", ["mre", {"name": "least_squares", "f0": 1e-6}])
 def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monkeypatch):
     """Where matrices follow signals: the same numbers, and an error estimate of the same size."""
     made = run(plant, observer="none", time={"horizon": horizon, "samples": 151})

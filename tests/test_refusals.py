@@ -52,7 +52,7 @@ def canonical(**changes):
             {
                 "plant": plant_from_mapping(UNBOUNDED),
                 "observer": {"name": "gpebo", "remedy": "current_coordinates"},
-                "estimator": {"name": "least_squares", "beta": 1.0, "bound": 1e9},
+                "estimator": {"name": "least_squares", "f0": 1e-6, "beta": 1, "bound": 1e9},
             },
             "forgets at a constant rate; accepted: estimator.bound=null",
         ),

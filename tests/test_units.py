@@ -112,6 +112,18 @@ def test_evidence_is_the_same_in_any_units(name, decades):
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
 
 
+@pytest.mark.parametrize("name", ["boost", "canonical", "circuit", "descriptor", "window", 2, 3])
+def test_estimates_with_no_gain_given_are_the_same_in_any_units(name):
+    """No gain of the default estimator has a unit: from when on a state is known it is the same."""
+    one, other, units = both(name, True, seed=[5, 1], estimator="ls_drem")
+    assert one.estimation.requirement.holds == other.estimation.requirement.holds
+    since = [one.estimable[state] for state in one.system.states]
+    known = one.estimation.t[:, None] >= np.array([np.inf if s is None else s for s in since])
+    size = np.abs(one.simulation.states).max(axis=0)
+    away = np.abs(other.estimation.states[0] / units.states - one.estimation.states[0])
+    assert (np.where(known, away, 0.0) <= 1e-8 * np.where(size > 0.0, size, size.max())).all()
+
+
 UNDER = {
     "reset": ["boost", "circuit", "published/gear_petzold", 8],
     "current_coordinates": ["boost", "canonical", "circuit", "descriptor", "published/gear_petzold",

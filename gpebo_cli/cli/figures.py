@@ -124,7 +124,10 @@ def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[R
 
 
 def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConfig]]:
-    """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values."""
+    """Configurations of a recipe: one, or those of its ``hydra.sweeper.params`` by their values.
+
+    A value is shown without its folder if that tells all of them apart.
+    """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.types import RunMode
@@ -137,8 +140,10 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
         return
     stored = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in swept.items()])
     (jobs,) = BasicSweeper.split_arguments(stored, None)
-    for words in jobs:
-        label = ", ".join(word.partition("=")[2] for word in words)
+    values = [[word.partition("=")[2] for word in words] for words in jobs]
+    labels = [", ".join(each) for each in values]
+    short = [", ".join(value.rpartition("/")[2] for value in each) for each in values]
+    for label, words in zip(short if len({*short}) == len(short) else labels, jobs, strict=True):
         config = loader.load_configuration(PRIMARY, [*overrides, *words], RunMode.RUN)
         yield label, config
 

@@ -19,7 +19,7 @@ from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reach
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
 from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, mix
-from gpebo_cli.estimators._segments import errors, estimate, goes_on, raised, tuned, tuned_for
+from gpebo_cli.estimators._segments import errors, estimate, goes_on, tuned, tuned_for
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.findings import Requirement
@@ -54,5 +54,5 @@ __all__ = [
     "VectorEstimates", "VectorLaw", "WindowEstimates", "Windowed", "WindowedEstimator", "able",
     "axis", "build", "combinations", "errors", "estimate", "gain", "goes_on", "information",
     "kreisselmeier", "lion", "low_pass", "mix", "names", "number", "per_name", "persistent",
-    "raised", "reached", "settings_of", "tuned", "tuned_for",
+    "reached", "settings_of", "tuned", "tuned_for",
 ]

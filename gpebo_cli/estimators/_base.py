@@ -48,17 +48,17 @@ class _Gain:
 
 def gain(
     default: float, accept: Accepted = "positive", *, by_parameter: bool = False,
-    auto: bool = False, raised: bool = False,
+    auto: bool = False, relative: bool = False,
 ) -> Any:
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
     It may be ``by_parameter``, a mapping which makes one case; ``auto``, which
     :meth:`GainEstimator.tuned` replaces: the larger the gain the faster, and the requirement says
-    which one is the least; ``raised``: where nothing was said (None) it is the default, and more
-    where that turns out to be too little, see :meth:`GainEstimator.raised`.
+    which one is the least; ``relative``: where nothing was said (None) the default is one without a
+    unit, relative to something of the data so far, and no case names it.
     """
     declared = _Gain(accept, by_parameter, auto, default)
-    return field(default=None if raised else default, metadata={"gain": declared})
+    return field(default=None if relative else default, metadata={"gain": declared})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,8 @@ class GainEstimator(ABC):
             elif declared.auto and is_auto(value):
                 axes[own.name] = (float("nan"),)
             elif value is None:
-                axes[own.name] = (declared.default,)
+                if own.default is not None:
+                    axes[own.name] = (declared.default,)
             else:
                 axes[own.name] = axis(value, where, declared.accept)
         return axes
@@ -112,19 +113,6 @@ class GainEstimator(ABC):
                 default = own.metadata["gain"].default
                 chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else default
         return replace(self, **chosen) if chosen else self
-
-    def raised(self, requirement: Requirement) -> Self:
-        """The estimator itself, or one with ten times the least gain that would do.
-
-        It is the latter where no gain was given and the default is less than that.
-        """
-        enough = _AMPLE * requirement.gain
-        unsaid = [
-            own.name for own in fields(self)
-            if own.default is None and getattr(self, own.name) is None and "gain" in own.metadata
-            and own.metadata["gain"].default < enough < np.inf
-        ]
-        return replace(self, **dict.fromkeys(unsaid, enough)) if unsaid else self
 
     def gains(self, name: str, parameters: Sequence[str]) -> Array:
         """The values of one gain, shape (g, 1), or (1, p) where it is a mapping by parameter.

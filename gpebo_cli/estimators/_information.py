@@ -8,10 +8,14 @@ its inverse is linear. With the memory z = e^{−∫β} and
     F⁻¹ = z f₀ I + α G_z,      η̂ = F (z f₀ η̂₀ + α h_z).
 
 For β = 0, z = 1 and these are the Gram matrix and ∫ψᵀY: regularised batch least squares.
+
+Without an f₀ nothing is known at the start. In the place of z f₀ I stands what rounding makes of
+the diagonal of G_z: it depends on the data so far only, and each parameter is in its own unit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,12 +23,13 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._scalar import MAX_ELEMENTS, SINGULAR, low_pass
+from gpebo_cli.evidence.knowledge import own_sizes
 from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.linear import LinearRegression, interpolation_error
 from gpebo_cli.regression.resets import ExtensionState, level_of
 
 _PICARD_ROUNDS = 200
@@ -32,6 +37,8 @@ _FORGOTTEN = 1e-200  # z that makes no difference to anything any more
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
+_NOTHING = 1e-2  # in units of rounding: an eigenvalue that is zero
+_PRIOR = 1e-3  # of what may be rounding stands for an f₀ that nobody gave
 CLEAR = 1e-8  # λ_min/λ_max, from which on the units that are given cost no digits worth a word
 
 
@@ -42,16 +49,37 @@ class Information:
     gram: Trajectory  # [G_z | h_z], shape (p, p + c)
     memory: Trajectory  # z, scalar
     level: Array  # (p,) diagonal of ∫ψᵀψ over this regression alone, or more
+    began: float  # when data were first gathered
+    # Units of parameters in which rounding of G_z is 1, by times (M,), its diagonal, and how wrong
+    # rounding may make that (M, p); None: an f₀ says what is known at the start.
+    units: Callable[[Array, Array, Array], Array] | None = None
 
     @property
     def reached(self) -> ExtensionState:
         """[G_z | h_z] and z at the end."""
-        return ExtensionState(self.gram.final, self.level, float(self.memory.final))
+        memory = float(self.memory.final)
+        return ExtensionState(self.gram.final, self.level, memory, began=self.began)
 
     def at(self, t: Array, inside: Array | None = None) -> InformationAt:
         """G_z, h_z and z at the times t (M,)."""
-        sampler = self.gram.mesh.sampler(t, inside)
-        return InformationAt(sampler(self.gram.values), sampler(self.memory.values))
+        mesh = self.gram.mesh
+        sampler = mesh.sampler(t, inside)
+        values, memory = sampler(self.gram.values), sampler(self.memory.values)
+        if self.units is None:
+            return InformationAt(values, memory)
+        share = (t - mesh.edges[sampler.element]) / mesh.steps[sampler.element]
+        rounding = interpolation_error(self.gram, sampler.element, share)
+        energy = np.einsum("mjj->mj", values[..., : rounding.shape[1]])
+        return InformationAt(values, np.ones_like(memory), self.units(t, energy, rounding))
+
+
+def prior_units(
+    energy: Array, terms: Array | float, elapsed: Array, rounding: Array | float = 0.0
+) -> Array:
+    """Units (M, p) in which about 1 of the diagonal of G_z is rounding; see ``own_sizes``."""
+    sizes, share = own_sizes(energy, terms, elapsed)
+    square = np.maximum(sizes**2 * share, rounding)
+    return np.asarray(np.sqrt(np.where((energy > 0.0) | (terms > 0.0), _PRIOR * square, 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,20 +87,40 @@ class InformationAt:
     """G_z, h_z and z at M times."""
 
     values: Array  # (M, p, p + c) [G_z | h_z]
-    memory: Array  # (M,)
+    memory: Array  # (M,); 1 in units of rounding
+    units: Array | None = None  # (M, p) in which rounding is 1
 
     @cached_property
     def spectrum(self) -> Spectrum:
-        """G_z = V diag(λ) Vᵀ."""
+        """G_z = V diag(λ) Vᵀ, in the units of rounding where nothing is known at the start."""
+        return self._in_units(self.units)
+
+    def _in_units(self, units: Array | None) -> Spectrum:
         p = self.values.shape[-2]
-        eigenvalues, vectors = np.linalg.eigh(self.values[..., :p])
-        rotated = transpose(vectors) @ self.values[..., p:]
-        return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, self.memory)
+        G = self.values[..., :p]
+        if units is not None:
+            G = G / units[..., None] / units[:, None]
+        eigenvalues, vectors = np.linalg.eigh(G)
+        if units is None:
+            rotated = transpose(vectors) @ self.values[..., p:]
+            return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, self.memory)
+        # Early in an element G_z is interpolated and may have negative eigenvalues. G_z η = h_z
+        # holds all the same, and both sides may change their sign.
+        size = np.abs(eigenvalues)
+        order = np.argsort(size, axis=1)
+        vectors = np.take_along_axis(vectors, order[:, None], 2) / units[..., None]
+        sign = np.take_along_axis(np.sign(eigenvalues), order, 1)[..., None]
+        rotated = sign * (transpose(vectors) @ self.values[..., p:])
+        ascending = np.take_along_axis(size, order, 1)
+        return Spectrum(ascending, vectors, rotated, self.memory, units)
 
     @cached_property
     def smallest(self) -> float:
         """The smallest eigenvalue of G_z at the last time."""
-        return max(float(np.linalg.eigvalsh(self.values[-1, :, : self.values.shape[1]])[0]), 0.0)
+        G = self.values[-1, :, : self.values.shape[1]]
+        if self.units is not None:
+            G = G / self.units[-1] / self.units[-1, :, None]
+        return max(float(np.linalg.eigvalsh(G)[0]), 0.0)
 
     def solution(self, alpha: float, f0: float, start: Array) -> Array:
         """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c).
@@ -83,41 +131,54 @@ class InformationAt:
         if start.any():
             values = values.copy()
             values[..., p:] -= values[..., :p] @ start[:, None]
+        unit: Array | float = 1.0
+        if self.units is not None:
+            unit = self.units[..., None]
+            values = values / unit
+            values[..., :p] /= transpose(unit)
         _, found, _ = laws.mixed(values, self.memory * (f0 / alpha))
-        return np.asarray(found + start[:, None])
+        return np.asarray(found / unit + start[:, None])
 
-    def quotient(self) -> tuple[Array, Array]:
-        """G_z⁻¹ h_z (M, p, c), and to how many digits, λ_min/λ_max (M,).
-
-        It is solved in units of each parameter's own size; other units may hide most digits.
-        """
-        values, p = self.values, self.values.shape[-2]
-        size = np.sqrt(np.maximum(np.einsum("mii->mi", values[..., :p]), 0.0))
-        size = np.where(size > 0.0, size, 1.0)[..., None]
-        eigenvalues, V = np.linalg.eigh(values[..., :p] / size / transpose(size))
-        found = Spectrum(np.maximum(eigenvalues, 0.0), V, V, size)
-        digits = _OWN * found.digits
-        inverse = np.where(digits[:, None] > SINGULAR, 1.0, 0.0) / np.where(
-            eigenvalues > 0.0, eigenvalues, 1.0
-        )
-        rotated = transpose(V) @ (values[..., p:] / size)
-        return (V @ (inverse[..., None] * rotated)) / size, digits
+    @cached_property
+    def in_own_units(self) -> Spectrum:
+        """The spectrum in units of each parameter's own size; other units may hide most digits."""
+        if self.units is not None:
+            return self.spectrum
+        energy = np.einsum("mii->mi", self.values[..., : self.values.shape[-2]])
+        return self._in_units(np.sqrt(np.where(energy > 0.0, energy, 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """G_z = V diag(λ) Vᵀ and Vᵀh_z at M times."""
+    """G_z = V diag(λ) Vᵀ and Vᵀh_z at M times, or U G_z U = V diag(λ) Vᵀ, with units U and UV."""
 
     eigenvalues: Array  # (M, p) ascending
-    vectors: Array  # (M, p, p)
-    rotated: Array  # (M, p, c) Vᵀ h_z
+    vectors: Array  # (M, p, p) V, or U V
+    rotated: Array  # (M, p, c) that transposed, times h_z
     memory: Array  # (M,) z
+    units: Array | None = None  # (M, p) reciprocals of U
 
     @property
     def digits(self) -> Array:
         """Smallest eigenvalue over the largest, (M,); 0 where G_z = 0."""
         smallest, largest = self.eigenvalues[:, 0], self.eigenvalues[:, -1]
-        return np.divide(smallest, largest, out=np.zeros_like(largest), where=largest > 0.0)
+        found = np.divide(smallest, largest, out=np.zeros_like(largest), where=largest > 0.0)
+        return found if self.units is None else _OWN * found
+
+    @property
+    def covectors(self) -> Array:
+        """The vectors' inverse, transposed, (M, p, p)."""
+        return self.vectors if self.units is None else self.units[..., None] ** 2 * self.vectors
+
+    def solution(self, alpha: float, f0: float, start: Array) -> Array:
+        """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c)."""
+        kept = (self.memory * f0)[:, None] * np.einsum("mji,j->mi", self.covectors, start)
+        coordinates = kept[..., None] / alpha + self.rotated
+        return np.asarray(self.vectors @ (self.share(alpha, f0)[..., None] * coordinates))
+
+    def share(self, alpha: float, f0: float) -> Array:
+        """Eigenvalues of αF, (M, p); times those of G_z, what the data decide of each direction."""
+        return np.asarray(alpha / (alpha * self.eigenvalues + (self.memory * f0)[:, None]))
 
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), zero where it is rounding, and to how many digits (M,)."""
@@ -127,8 +188,10 @@ class Spectrum:
         return self.vectors @ inverse, self.digits
 
     def covariance(self, alpha: float, f0: float) -> Array:
-        """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p)."""
-        share = alpha / (alpha * self.eigenvalues + (self.memory * f0)[:, None])
+        """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p); 0 where rounding alone gives data a part."""
+        share = self.share(alpha, f0)
+        if self.units is not None:
+            share = np.where(self.eigenvalues > _NOTHING, share, 0.0)
         return np.asarray((self.vectors * share[:, None]) @ transpose(self.vectors))
 
     def forgetting(self, alpha: float, f0: float, beta: float, bound: float | None) -> Array:
@@ -147,23 +210,32 @@ def check_held(regression: LinearRegression, count: int) -> None:
 
 
 def information(
-    regression: LinearRegression, alpha: float, f0: float, beta: float, bound: float | None,
-    known: ExtensionState | None = None,
+    regression: LinearRegression, alpha: float, f0: float | None, beta: float,
+    bound: float | None, known: ExtensionState | None = None,
 ) -> Information:
     """G_z, h_z and z for one set of gains, from those ``known`` at the start; None: 0, 0 and 1.
 
-    With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and f₀ do not
-    matter.
+    With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and the size of
+    f₀ do not matter.
     """
     level, before = level_of(regression.gram.final), 1.0
+    began = float(regression.mesh.edges[0])
     if known is not None:
         level, before = np.maximum(level, known.level), known.memory
+        began = known.began
+
+    def units(t: Array, energy: Array, rounding: Array) -> Array:
+        return prior_units(energy, regression.terms(t), t - began, rounding)
+
+    def made(gram: Trajectory, memory: Trajectory) -> Information:
+        return Information(gram, memory, level, began, units if f0 is None else None)
+
     if beta == 0.0:
         gram = regression.gram
         if known is not None:
             gram = Trajectory(gram.mesh, gram.values + known.values)
         memory = np.full(regression.mesh.points.shape, before)
-        return Information(gram, Trajectory(regression.mesh, memory), level)
+        return made(gram, Trajectory(regression.mesh, memory))
     if bound is None:
         start = None if known is None else beta * known.values
         # β ∫ e^{−β(t−s)} (·) ds
@@ -171,17 +243,15 @@ def information(
         mesh = filtered.mesh
         # Never 0, beside which what is not excited has a share of 0/0.
         memory = np.maximum(before * np.exp(-beta * (mesh.points - mesh.edges[0])), _FORGOTTEN)
-        return Information(
-            Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory), level
-        )
-    return _bounded(regression, alpha, f0, beta, bound, known, level)
+        return made(Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory))
+    return made(*_bounded(regression, alpha, f0 or 0.0, beta, bound, known))
 
 
 def _bounded(
     regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float,
-    known: ExtensionState | None, level: Array,
-) -> Information:
-    """Forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
+    known: ExtensionState | None,
+) -> tuple[Trajectory, Trajectory]:
+    """[G_z | h_z] and z with forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
 
     ‖F‖ = 1/λ_min(F⁻¹) depends on the past of β, so elements are solved one after the other, each
     by fixed-point iteration on β at its nodes; the map contracts with the element's length.
@@ -228,4 +298,4 @@ def _bounded(
         decay = np.exp(-h * (R @ beta))
         gram[k, 1:], memory[k, 1:] = nodes, z * decay
         G, z = nodes[-1], z * decay[-1]
-    return Information(Trajectory(mesh, gram), Trajectory(mesh, memory), level)
+    return Trajectory(mesh, gram), Trajectory(mesh, memory)

@@ -109,10 +109,10 @@ def scalar_errors(
 ) -> ErrorSystem:
     """Errors of filters behind Y and of the scalar law behind them, δη̂' = γΔ(adj δf − Δ δη̂).
 
-    The filters are as of ``filtered_errors``, with s states; Δ is (N,), γ (1,) or (p,), and what
-    makes δ𝐘 of the filters' errors (N, p, s).
+    The filters are as of ``filtered_errors``, with s states; Δ is (N,), γ (1,) or (p,), or at each
+    time (N, …), and what makes δ𝐘 of the filters' errors (N, p, s).
     """
-    weighted = delta[:, None, None] * gain[:, None]
+    weighted = delta[:, None, None] * gain[..., None]
     law = weighted * delta[:, None, None] * np.eye(adjugate.shape[1])
     return filtered_errors(filters, into, law, weighted * adjugate)
 
@@ -125,9 +125,12 @@ def reached(size: Array, extended: Trajectory, known: Known) -> ExtensionState:
 
 def energy_requirement(
     condition: str, gain: float, energy: float, needed: float = DECAY,
-    needed_for: str = "1 % of the initial error", of: str = "∫Δ²",
+    needed_for: str = "1 % of the initial error", of: str = "∫Δ²", *, paced: bool = False,
 ) -> Requirement:
-    """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}."""
+    """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}.
+
+    If it is ``paced``, γ is one over the length T of the memory.
+    """
     reached, least = gain * energy, needed / energy if energy > 0.0 else float("inf")
     return Requirement(
         name=condition,
@@ -138,8 +141,9 @@ def energy_requirement(
             "needed": needed,
         },
         text=(
-            f"γ{of} = {reached:.3g} at the smallest gain {gain:.3g}; "
-            f"{needed_for} needs {needed:.3g}{would_do(gain, least)}"
+            (f"{gain:g} ∫Δ²/T = {reached:.3g}, T being the length of the memory; " if paced
+             else f"γ{of} = {reached:.3g} at the smallest gain {gain:.3g}; ")
+            + f"{needed_for} needs {needed:.3g}{'' if paced else would_do(gain, least)}"
         ),
         gain=least,
     )
@@ -158,9 +162,9 @@ class RecursiveMixed:
 
     def __init__(
         self, settings: GainEstimator, parameters: Sequence[str], mixing: Mixing,
-        condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0,
+        condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0, *, paced: bool = False,
     ) -> None:
-        self._mixing = mixing
+        self._mixing, self._paced = mixing, paced
         self._aim = (condition, DECAY, "1 % of the initial error") if mu == 1.0 else finite_time(mu)
         gains = settings.gains("gamma", parameters)
         self._law = ScalarLaw(settings.start(parameters), gains, groups, mu, self._aim[1])
@@ -174,7 +178,7 @@ class RecursiveMixed:
         """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
         condition, needed, what = self._aim
         gain, energy = float(self._law.gains.min()), float(self._law.energy.min())
-        return energy_requirement(condition, gain, energy, needed, what)
+        return energy_requirement(condition, gain, energy, needed, what, paced=self._paced)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +228,7 @@ class MixedEstimates(Lasting):
         """γ∫Δ² over the horizon: the error has shrunk by its exponential."""
         return energy_requirement(
             self.condition, float(self.gains.min()), min(self.energies), self.needed,
-            self.needed_for,
+            self.needed_for, paced=self.groups[0].pace is not None,
         )
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:

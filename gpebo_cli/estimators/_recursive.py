@@ -58,14 +58,20 @@ class InformationRoot:
         return out, memory
 
 
-def spectrum(root: Array, memory: Array) -> Spectrum:
-    """G_z = V diag(σ²) Vᵀ and Vᵀh_z = σ c from S = [U diag(σ) Vᵀ | U c], shape (K, …)."""
+def spectrum(root: Array, memory: Array, units: Array | None = None) -> Spectrum:
+    """G_z = V diag(σ²) Vᵀ and Vᵀh_z = σ c from S = [U diag(σ) Vᵀ | U c], shape (K, …).
+
+    With units (K, p) it is about the parameters in these.
+    """
     p = root.shape[-1] - 1
-    U, sigma, Vt = np.linalg.svd(root[..., :p, :p])
+    own = root[..., :p, :p] if units is None else root[..., :p, :p] / units[:, None]
+    U, sigma, Vt = np.linalg.svd(own)
     order = np.arange(p)[::-1]  # ascending, as of eigenvalues
-    U, sigma, Vt = U[..., order], sigma[..., order], Vt[..., order, :]
+    U, sigma, vectors = U[..., order], sigma[..., order], transpose(Vt[..., order, :])
+    if units is not None:
+        vectors = vectors / units[..., None]
     coordinates = np.swapaxes(U, -1, -2) @ root[..., :p, p:]
-    return Spectrum(sigma**2, np.swapaxes(Vt, -1, -2), sigma[..., None] * coordinates, memory)
+    return Spectrum(sigma**2, vectors, sigma[..., None] * coordinates, memory, units)
 
 
 def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
@@ -96,12 +102,15 @@ class ScalarLaw:
     def update(
         self, regression: SampledRegression, delta: Array, quotient: Array, usable: BoolArray,
         behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]] | None = None,
+        pace: Array | float = 1.0,
     ) -> SampledEstimates:
         """One closed-form step per sample, for what :class:`Mixed` has, (K, D) and (K, D, p).
 
         Where η̄ is rounding its weight Δ² is nothing.
         """
-        energy, previous, had = self._steps.update(regression, delta**2, quotient, usable)
+        energy, previous, had = self._steps.update(
+            regression, pace * delta**2, quotient, usable
+        )
         x = self.gains * energy[:, :, None, None]  # (K, D, g, 1 or p)
         decay = np.exp(-x)
         new, old = quotient[:, :, None], np.where(had[..., None], previous, quotient)[:, :, None]
@@ -159,6 +168,7 @@ class Mixed(NamedTuple):
     usable: BoolArray  # where η̄ is more than rounding (K, D)
     # Of each group the filter of 𝒴, and what η̄ is of 𝒴 (K, p, p), zero where it is rounding.
     behind: Callable[[], tuple[Sequence[Filter], Sequence[Array]]]
+    pace: Array | float = 1.0  # what γ is multiplied by (K, D)
 
 
 def over_steps(regression: SampledRegression, values: Array, before: Array) -> Array:

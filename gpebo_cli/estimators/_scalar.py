@@ -23,6 +23,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 
+Pace = Callable[[Array], Array]  # times (N,) -> what γ is multiplied by there (N,)
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)
 MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 
@@ -95,14 +96,20 @@ class ScalarPath:
     signals: MixedSignals
     digits: Array  # (K, s + 1) σ_min/σ_max of Ω, or less by a factor of up to p
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
-    energy: Array  # (K, s + 1) I
+    energy: Array  # (K, s + 1) I, with the pace
     t: Array  # (M,)
     energy_at_t: Array  # (M,)
     floor: float  # size below which comparable η̂ is rounding
+    pace: Pace | None = None  # None: 1
 
     def delta(self, t: Array) -> Array:
         """Δ at the times t (N,)."""
         return self.signals(t, t)[0]
+
+    @property
+    def clearest(self) -> Array:
+        """η̄ (p,) where it is known to the most digits."""
+        return np.asarray(self.quotient[np.unravel_index(self.digits.argmax(), self.digits.shape)])
 
     def comparable(self, units: Array | float) -> ScalarPath:
         """The same of parameters in units (p,), in which they are comparable."""
@@ -171,17 +178,17 @@ def _drifts(path: ScalarPath, gain: float, size: float) -> bool:
     """Whether small steps of η̄, beside η̂ of a ``size``, add up to more than its rounding."""
     weight = np.minimum(1.0, gain * path.energy)[..., None]
     rounding = _SLACK * _ROUNDING / np.maximum(path.digits, _ROUNDING)
-    rounding = np.maximum(rounding, rounding[-1, -1])[..., None]
-    change = np.abs(path.quotient - path.quotient[-1, -1]) - size * rounding
+    change = np.abs(path.quotient - path.clearest) - size * rounding[..., None]
     return bool((weight * change).max(initial=0.0) > _CONSTANT * size)
 
 
 def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     """η̄ constant: η̂ = η̄ + e^{−γI} (η̂(0) − η̄), (g, M, p); arguments as in :func:`scalar_law`.
 
-    That is one step of the law with η̄ linear in I, over which nothing changes.
+    That is one step of the law with η̄ linear in I, over which nothing changes. Of all η̄ it is the
+    one with the most digits: what grows may leave few of them at the end.
     """
-    final = path.quotient[-1, -1:]
+    final = path.clearest[None]
     whole = path.energy.ravel()[-1:]
     zero, count = np.zeros_like(final), len(path.t)
     return kernels.laws.stepped_law(
@@ -280,14 +287,17 @@ def _element_maps(
     delta, Y, digits = path.signals(points.ravel(), inside.ravel())
     delta, Y = delta.reshape(points.shape)[:, 1:], Y.reshape(*points.shape, p)[:, 1:]
     size, per_lane = len(h), p // lanes  # parameters that share a gain
-    energy = h[:, None] * delta**2
+    scaled = h[:, None] * delta
+    if path.pace is not None:
+        scaled *= path.pace(points.ravel()).reshape(points.shape)[:, 1:]
+    energy = scaled * delta
     rate = energy[:, None, None] * gains[None, :, :, None]  # (K, g, l, s)
     operator = np.broadcast_to(
         rule.differentiation, (size, g, lanes, rule.stages, rule.stages)
     ).copy()
     diagonal = np.arange(rule.stages)
     operator[..., diagonal, diagonal] += rate
-    forcing = (h[:, None] * delta)[..., None] * Y
+    forcing = scaled[..., None] * Y
     right = np.empty((size, g, lanes, rule.stages, 1 + per_lane))
     right[..., 0] = rule.differentiation.sum(axis=1)
     by_lane = np.moveaxis(forcing.reshape(size, rule.stages, lanes, per_lane), 1, 2)
@@ -325,13 +335,16 @@ def _values(maps: Array, start: Array) -> Array:
 
 def scalar_path(
     mesh: Mesh, signals: MixedSignals, delta: Array, digits: Array, quotient: Array, t: Array,
-    floor: float,
+    floor: float, pace: Pace | None = None,
 ) -> ScalarPath:
     """Prepare the law for Δ, digits (K, s + 1) and η̄ (K, s + 1, p), reported at times t (M,)."""
-    energy = np.maximum.accumulate(Trajectory(mesh, delta**2).integral().values.ravel())
+    weight = delta**2
+    if pace is not None:
+        weight *= pace(mesh.points.ravel()).reshape(delta.shape)
+    energy = np.maximum.accumulate(Trajectory(mesh, weight).integral().values.ravel())
     energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    return ScalarPath(mesh, signals, digits, quotient, energy, t, at_t, floor)
+    return ScalarPath(mesh, signals, digits, quotient, energy, t, at_t, floor, pace)
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:

@@ -56,11 +56,6 @@ def goes_on(estimator: Estimator) -> bool:
     return all(isinstance(member, Windowed) for member in members)
 
 
-def raised(estimator: Estimator, requirement: Requirement) -> Estimator:
-    """The estimator, with higher gains where none were given and the default is too low."""
-    return estimator.raised(requirement) if isinstance(estimator, GainEstimator) else estimator
-
-
 def estimate(
     estimator: Estimator, regression: LinearRegression, t: Array, shown: Array | None = None
 ) -> Estimates:

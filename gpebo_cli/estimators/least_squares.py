@@ -18,6 +18,7 @@ from gpebo_cli.estimators._information import (
     Spectrum,
     check_held,
     information,
+    prior_units,
 )
 from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
@@ -45,23 +46,29 @@ class LeastSquares(ResumableEstimator):
 
     Attributes:
         alpha: α > 0.
-        f0: f₀ > 0.
+        f0: f₀ > 0; None: nothing is known at the start, and η̂ leaves η̂₀ when data tell more than
+            rounding.
         beta: forgetting rate ≥ 0; 0 remembers everything.
         bound: M ≥ 1/f₀ of β (1 − ‖F‖/M), or None for constant forgetting.
     """
 
     alpha: object = gain(1.0)
-    f0: object = gain(1e-6)
+    f0: object = gain(1.0, relative=True)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
 
     def axes(self) -> dict[str, Sequence[float]]:
         """The gains as axes, f₀ checked against the bound.
 
-        ConfigError: a gain is no gain, or M is below 1/f₀.
+        ConfigError: a gain is no gain, M is below 1/f₀, or there is an M without an f₀.
         """
         axes = super().axes()
         bound = self.covariance_bound
+        if bound is not None and "f0" not in axes:
+            raise ConfigError(
+                f"estimator.bound = {bound:g} is one of the covariance, which starts at 1/f0: give "
+                "estimator.f0, too"
+            )
         if bound is not None and bound < 1.0 / min(axes["f0"]):
             raise ConfigError(
                 f"estimator.bound = {bound:g} is below 1/f0 = {1.0 / min(axes['f0']):g}, where the "
@@ -81,9 +88,9 @@ class LeastSquares(ResumableEstimator):
             case: Mapping[str, float], info: Information, t: Array, inside: Array
         ) -> ErrorSystem:
             s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
-            rate = s.forgetting(case["alpha"], case["f0"], case["beta"], self.covariance_bound)
+            rate = s.forgetting(case["alpha"], f0_of(case), case["beta"], self.covariance_bound)
             A = -rate[:, None, None] * np.eye(regression.p)
-            C = s.covariance(case["alpha"], case["f0"])
+            C = s.covariance(case["alpha"], f0_of(case))
             return ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
 
         infos = self.informations(regression, known)
@@ -94,13 +101,13 @@ class LeastSquares(ResumableEstimator):
         bound, cases = self.covariance_bound, self.cases
         bounded = bound is not None and max(case["beta"] for case in cases) > 0.0
         needed = ["alpha", "f0", "beta"] if bounded else ["beta"]
-        keys = [tuple(case[name] for name in needed) for case in cases]
+        keys = [tuple(case.get(name) for name in needed) for case in cases]
         check_held(regression, len(set(keys)))
-        made: dict[tuple[float, ...], Information] = {}
+        made: dict[tuple[float | None, ...], Information] = {}
         for key, case, before in zip(keys, cases, known or repeat(None), strict=False):
             if key not in made:
                 made[key] = information(
-                    regression, case["alpha"], case["f0"], case["beta"], bound, before
+                    regression, case["alpha"], case.get("f0"), case["beta"], bound, before
                 )
         return [made[key] for key in keys]
 
@@ -131,13 +138,21 @@ class LeastSquares(ResumableEstimator):
         start = self.start(regression.parameters)
         prior = np.column_stack([np.eye(p), start])
         ones = np.ones(p)
-        return solved(np.array([
-            filtered(
+
+        def known(case: Mapping[str, float]) -> Array:
+            """[F⁻¹ | 𝒴] at the times t, (M, p, p + 1)."""
+            gram = filtered(
                 regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics,
-                case["f0"] * prior,
+                case.get("f0", 0.0) * prior,
             )(t)
-            for case in self.cases
-        ]), dynamics.units)
+            if "f0" not in case:
+                energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
+                elapsed = t - regression.mesh.edges[0]
+                units = prior_units(energy, regression.terms(t), elapsed, rounding)
+                gram += units[..., None] ** 2 * prior
+            return gram
+
+        return solved(np.array([known(case) for case in self.cases]), dynamics.units)
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).
@@ -189,18 +204,18 @@ class LeastSquaresEstimates(Unmixed, Lasting):
     def requirement(self) -> Requirement:
         """α λ_min(G)/f₀ at the horizon: the slowest direction's error has shrunk by 1 + that."""
         ratios = [
-            case["alpha"] * own.smallest / (case["f0"] * float(own.memory[-1]))
+            case["alpha"] * own.smallest / (f0_of(case) * float(own.memory[-1]))
             if own.memory[-1] > 0
             else np.inf
             for case, own in zip(self.cases, self.known, strict=True)
         ]
-        return ratio_requirement(float(min(ratios)))
+        return ratio_requirement(float(min(ratios)), self.known[0].units is None)
 
     def weights(self, case: int) -> Array:
         """z f₀I + αG_z (M, p, p)."""
         s, gains = self.known[case].spectrum, self.cases[case]
-        values = s.memory[:, None] * gains["f0"] + gains["alpha"] * s.eigenvalues
-        return np.asarray((s.vectors * values[:, None]) @ transpose(s.vectors))
+        values = gains["alpha"] / s.share(gains["alpha"], f0_of(gains))
+        return np.asarray((s.covectors * values[:, None]) @ transpose(s.covectors))
 
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
@@ -211,19 +226,21 @@ class LeastSquaresEstimates(Unmixed, Lasting):
         few = len(self.cases) <= _FEW and len(self.start) > _SMALL
         eta = []
         for case, at, own in zip(chosen, known, starts, strict=True):
-            gains = case["alpha"], case["f0"], own
-            alone = few or at.spectrum.digits[-1] < CLEAR
-            eta.append(at.solution(*gains) if alone else solution(at.spectrum, *gains))
+            gains = case["alpha"], f0_of(case), own
+            alone = few or (at.units is None and at.spectrum.digits[-1] < CLEAR)
+            eta.append(at.solution(*gains) if alone else at.spectrum.solution(*gains))
         found = np.array(eta)
         return found.reshape(*found.shape[:3], *self.realisations)
 
 
-def ratio_requirement(reached: float) -> Requirement:
-    """Whether α λ_min(G)/f₀ is enough."""
+def ratio_requirement(reached: float, prior: bool) -> Requirement:
+    """Whether α λ_min(G) is enough beside f₀ or, without such a ``prior``, beside rounding."""
+    beside = "f₀" if prior else "what is rounding"
     return Requirement(
         name="λ_min(G) → ∞", holds=reached >= _NEEDED,
         evidence={"alpha_lambda_min_over_f0": reached, "needed": _NEEDED},
-        text=f"α λ_min(G)/f₀ = {reached:.3g}; 1 % of the initial error needs {_NEEDED:g}",
+        text=f"α λ_min(G) is {reached:.3g} times {beside}; 1 % of the initial error needs "
+        f"{_NEEDED:g}",
     )
 
 
@@ -235,24 +252,32 @@ class RecursiveLeastSquares:
         self._start = settings.start(parameters)
         betas, self._which = np.unique([c["beta"] for c in self._cases], return_inverse=True)
         self._root = InformationRoot(len(parameters), betas)
+        self._own, self._elapsed = settings.f0 is None, 0.0
         self._ratio = 0.0
 
-    def spectra(self, regression: SampledRegression) -> list[Spectrum]:
-        """The spectrum of G_z at the samples, of every case."""
-        roots, memory = self._root.update(regression)
-        found = [spectrum(roots[:, d], memory[:, d]) for d in range(roots.shape[1])]
-        return [found[d] for d in self._which]
+    def spectra(self, regression: SampledRegression) -> tuple[list[Spectrum], Array]:
+        """The spectrum of G_z at the samples, of every case, and the seconds of data (K,)."""
+        (roots, memory), p = self._root.update(regression), regression.p
+        elapsed, found = self._elapsed + np.cumsum(regression.steps), []
+        self._elapsed = float(elapsed[-1])
+        for d in range(roots.shape[1]):
+            root, z, units = roots[:, d], memory[:, d], None
+            if self._own:
+                energy = (root[..., :p] ** 2).sum(axis=1)
+                z, units = np.ones_like(z), prior_units(energy, regression.scale, elapsed)
+            found.append(spectrum(root, z, units))
+        return [found[d] for d in self._which], elapsed
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        spectra = self.spectra(regression)
+        spectra, _ = self.spectra(regression)
         ratios = np.min([
-            case["alpha"] * s.eigenvalues.min(axis=1, initial=np.inf) / (case["f0"] * s.memory)
+            case["alpha"] * s.eigenvalues.min(axis=1, initial=np.inf) / (f0_of(case) * s.memory)
             for case, s in zip(self._cases, spectra, strict=True)
         ], axis=0)
         self._ratio = float(ratios[-1])
         solved = [
-            solution(s, case["alpha"], case["f0"], self._start)
+            s.solution(case["alpha"], f0_of(case), self._start)
             for case, s in zip(self._cases, spectra, strict=True)
         ]
 
@@ -260,7 +285,7 @@ class RecursiveLeastSquares:
             """δη̂ = αF δh_z."""
             filters = [integrating(regression, case["beta"]) for case in self._cases]
             return tuple(
-                ErrorRecursion(*own, s.covariance(case["alpha"], case["f0"]))
+                ErrorRecursion(*own, s.covariance(case["alpha"], f0_of(case)))
                 for own, case, s in zip(filters, self._cases, spectra, strict=True)
             )
 
@@ -269,16 +294,12 @@ class RecursiveLeastSquares:
     @property
     def requirement(self) -> Requirement:
         """α λ_min(G)/f₀ so far."""
-        return ratio_requirement(self._ratio)
+        return ratio_requirement(self._ratio, not self._own)
 
 
-def solution(s: Spectrum, alpha: float, f0: float, start: Array) -> Array:
-    """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z) from the spectrum, shape (M, p, c)."""
-    weight = (s.memory * f0)[:, None, None]
-    rotated_start = np.einsum("mji,j->mi", s.vectors, start)[..., None]
-    slowness = weight + alpha * s.eigenvalues[..., None]
-    coordinates = (weight * rotated_start + alpha * s.rotated) / slowness
-    return np.asarray(s.vectors @ coordinates)
+def f0_of(case: Mapping[str, float]) -> float:
+    """f₀, or 1 in the units of rounding where there is none."""
+    return case.get("f0", 1.0)
 
 
 ESTIMATOR = LeastSquares

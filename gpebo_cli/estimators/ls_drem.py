@@ -13,7 +13,12 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import CLEAR, Information, Spectrum, check_held
+from gpebo_cli.estimators._information import (
+    Information,
+    InformationAt,
+    Spectrum,
+    check_held,
+)
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
@@ -21,8 +26,8 @@ from gpebo_cli.estimators._mixed import (
     scalar_errors,
 )
 from gpebo_cli.estimators._recursive import Mixed, quotient_of
-from gpebo_cli.estimators._scalar import SINGULAR, ScalarPath, filled, scalar_path
-from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares
+from gpebo_cli.estimators._scalar import SINGULAR, Pace, ScalarPath, filled, scalar_path
+from gpebo_cli.estimators.least_squares import LeastSquares, RecursiveLeastSquares, f0_of
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -31,6 +36,8 @@ from gpebo_cli.regression.resets import Known
 from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _AT_ONCE = 4096  # elements
+_NO_TIME = 1e-300  # seconds, at the start
+_F0 = 1e-4  # beside a γ that is given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,17 +49,23 @@ class LsDrem(ResumableEstimator):
     Δ is not square integrable: a γ of order 1 does what 1e10 does behind fading filters.
 
     Attributes:
-        gamma: γ, also by parameter; None: 10, or ten times the least that turns out to be needed,
-            where that is more.
-        alpha, f0, beta, bound: of the least-squares part, see ``least_squares``.
+        gamma: γ, also by parameter; None: 50 over the length of the memory, ∫ e^{−β(t−s)} ds, so
+            that no unit and no horizon has a part in it.
+        alpha, f0, beta, bound: of the least-squares part, see ``least_squares``; beside a γ that
+            is given f₀ is 1e-4 where nothing was said.
         initial: η̂ (and ĝ) at the start.
     """
 
     alpha: object = gain(1.0)
-    f0: object = gain(1e-4)
+    f0: object = gain(1.0, relative=True)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    gamma: object = gain(10.0, by_parameter=True, auto=True, raised=True)
+    gamma: object = gain(50.0, by_parameter=True, auto=True, relative=True)
+
+    def __post_init__(self) -> None:
+        """A γ has a unit, and so has the f₀ beside it."""
+        if self.gamma is not None and self.f0 is None:
+            object.__setattr__(self, "f0", _F0)
 
     @property
     def least_squares(self) -> LeastSquares:
@@ -72,8 +85,10 @@ class LsDrem(ResumableEstimator):
             case: Mapping[str, float], info: Information, gain: Array, t: Array, inside: Array
         ) -> ErrorSystem:
             s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
-            rate = s.forgetting(case["alpha"], case["f0"], case["beta"], part.covariance_bound)
-            delta, weights = _adjugate(s, case["alpha"], case["f0"])
+            rate = s.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
+            delta, weights = _adjugate(s, case["alpha"], f0_of(case))
+            if self.gamma is None:
+                gain = gain * _pace(info.began, case["beta"], t)[:, None]
             adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
             rates = np.broadcast_to(rate[:, None], weights.shape)
             return scalar_errors(rates, into, delta, adjugate, gain)
@@ -85,8 +100,9 @@ class LsDrem(ResumableEstimator):
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
-        mixing = partial(_mixed, part, cases)
-        return RecursiveMixed(self, parameters, mixing, "IE", len(cases), mu)
+        mixing = partial(_mixed, part, cases, self.gamma is None)
+        paced = self.gamma is None
+        return RecursiveMixed(self, parameters, mixing, "IE", len(cases), mu, paced=paced)
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,), each with a path of its own."""
@@ -94,7 +110,10 @@ class LsDrem(ResumableEstimator):
         check_held(regression, len(part.cases))
         infos = part.informations(regression, known)
         groups = tuple(
-            mix_least_squares(info, case["alpha"], case["f0"], t, regression.floor)
+            mix_least_squares(
+                info, case["alpha"], f0_of(case), t, regression.floor,
+                partial(_pace, info.began, case["beta"]) if self.gamma is None else None,
+            )
             for info, case in zip(infos, part.cases, strict=True)
         )
         return mixed_estimates(
@@ -102,24 +121,39 @@ class LsDrem(ResumableEstimator):
         )
 
 
+def one_over_memory(elapsed: Array, beta: float) -> Array:
+    """1/∫ e^{−β(t−s)} ds over the time since data were first gathered, (N,)."""
+    elapsed = np.maximum(elapsed, _NO_TIME)
+    return np.asarray(beta / -np.expm1(-beta * elapsed) if beta else 1.0 / elapsed)
+
+
+def _pace(began: float, beta: float, t: Array) -> Array:
+    return one_over_memory(t - began, beta)
+
+
 def _mixed(
-    part: RecursiveLeastSquares, cases: Sequence[Mapping[str, float]], regression: SampledRegression
+    part: RecursiveLeastSquares, cases: Sequence[Mapping[str, float]], paced: bool,
+    regression: SampledRegression,
 ) -> Mixed:
     """Least squares at samples, and mixing; a group for each of its cases."""
-    spectra = part.spectra(regression)
+    spectra, elapsed = part.spectra(regression)
     delta = [
-        np.prod(_shares(s, case["alpha"], case["f0"]), axis=1)
+        np.prod(s.eigenvalues * s.share(case["alpha"], f0_of(case)), axis=1)
         for s, case in zip(spectra, cases, strict=True)
     ]
     quotient, usable, inverse = zip(*map(quotient_of, spectra), strict=True)
     return Mixed(
         np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
         lambda: ([integrating(regression, case["beta"]) for case in cases], inverse),
+        np.stack([
+            one_over_memory(elapsed, case["beta"]) for case in cases
+        ], axis=1) if paced else 1.0,
     )
 
 
 def mix_least_squares(
-    info: Information, alpha: float, f0: float, t: Array, floor: float = 0.0
+    info: Information, alpha: float, f0: float, t: Array, floor: float = 0.0,
+    pace: Pace | None = None,
 ) -> ScalarPath:
     """The path of H = I − z f₀ F that the scalar law takes, reported at the times t (M,).
 
@@ -129,52 +163,46 @@ def mix_least_squares(
     mesh = info.gram.mesh
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
-        s = info.at(t, inside).spectrum
-        delta, weights = _adjugate(s, alpha, f0)
-        Y, digits = s.vectors @ (weights[..., None] * s.rotated), s.digits
-        if in_own_units:
-            quotient, digits = info.at(t, inside).quotient()
+        delta, quotient, digits, s = _mixed_at(info.at(t, inside), alpha, f0)
+        Y = delta[:, None, None] * quotient
+        if info.units is None:
             known = (digits > SINGULAR)[:, None, None]
-            Y = np.where(known, delta[:, None, None] * quotient, Y)
+            Y = np.where(known, Y, s.vectors @ (_adjugate(s, alpha, f0)[1][..., None] * s.rotated))
         return delta, Y.reshape(len(t), -1), digits
 
     shape = mesh.points.shape
     digits, delta = np.empty(shape), np.empty(shape)
     rows, columns = info.gram.values.shape[-2:]
     quotient = np.empty((*shape, rows * (columns - rows)))
-    # If few digits are left in the units that are given, each parameter's own size is the unit.
-    for in_own_units in (False, True):
-        for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once would take much memory
-            part = slice(first, first + _AT_ONCE)
-            points = mesh.points[part]
-            at = info.at(points.ravel(), mesh.inside[part].ravel())
-            found, known = at.quotient() if in_own_units else at.spectrum.quotient()
-            digits[part] = known.reshape(points.shape)
-            quotient[part] = found.reshape(*points.shape, -1)
-            if not in_own_units:
-                shares = _shares(at.spectrum, alpha, f0)
-                delta[part] = np.prod(shares, axis=1).reshape(points.shape)
-        usable = digits > SINGULAR
-        if digits.max() > CLEAR:
-            break
-    return scalar_path(mesh, signals, delta, digits, filled(quotient, usable), t, floor)
+    for first in range(0, mesh.size, _AT_ONCE):  # all spectra at once would take much memory
+        part = slice(first, first + _AT_ONCE)
+        at = info.at(mesh.points[part].ravel(), mesh.inside[part].ravel())
+        found = _mixed_at(at, alpha, f0)[:3]
+        for whole, own in zip((delta, quotient, digits), found, strict=True):
+            whole[part] = own.reshape(-1, *whole.shape[1:])
+    usable = digits > SINGULAR
+    return scalar_path(mesh, signals, delta, digits, filled(quotient, usable), t, floor, pace)
+
+
+def _mixed_at(
+    at: InformationAt, alpha: float, f0: float
+) -> tuple[Array, Array, Array, Spectrum]:
+    """Δ (M,), 𝐘/Δ = G_z⁻¹ h_z (M, p, c), its digits (M,), and the spectrum that H is of.
+
+    The quotient is solved in parameters' own units: others may hide most digits.
+    """
+    delta = np.prod(at.spectrum.eigenvalues * at.spectrum.share(alpha, f0), axis=1)
+    quotient, digits = at.in_own_units.quotient()
+    return delta, quotient, digits, at.spectrum
 
 
 def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:
     """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
-    shares = _shares(s, alpha, f0)
-    others = np.empty_like(shares)
-    for i in range(shares.shape[1]):
-        others[:, i] = np.prod(np.delete(shares, i, axis=1), axis=1)
-    return np.prod(shares, axis=1), others * alpha / (
-        alpha * s.eigenvalues + (s.memory * f0)[:, None]
-    )
-
-
-def _shares(s: Spectrum, alpha: float, f0: float) -> Array:
-    """Eigenvalues of H, shape (M, p): the share of each direction that the data decide."""
-    data = alpha * s.eigenvalues
-    return np.asarray(data / (data + (s.memory * f0)[:, None]))
+    share = s.share(alpha, f0)
+    h, others = share * s.eigenvalues, np.empty_like(share)  # eigenvalues of H
+    for i in range(h.shape[1]):
+        others[:, i] = np.prod(np.delete(h, i, axis=1), axis=1)
+    return np.prod(h, axis=1), others * share
 
 
 ESTIMATOR = LsDrem

@@ -124,15 +124,12 @@ def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
     gram, rounding = regression.gram_with_rounding(at)
     rounding = rounding + regression.rounding_of(gram)
-    return knowledge(gram, *_beside(regression, at, tol), rounding)
+    return knowledge(gram, *_beside(regression, at), tol, rounding)
 
 
-def _beside(regression: LinearRegression, at: Array, tol: float) -> tuple[Array, Array, float]:
+def _beside(regression: LinearRegression, at: Array) -> tuple[Array, Array]:
     """What sizes at some times (N,) are compared with, see :func:`knowledge`."""
-    mesh = regression.mesh
-    sizes = np.broadcast_to(regression.scale, (mesh.size, regression.p))
-    element = mesh.edges[1:-1].searchsorted(at, side="left")
-    return sizes[element], at - mesh.edges[0], tol
+    return regression.terms(at), at - regression.mesh.edges[0]
 
 
 def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
@@ -143,7 +140,7 @@ def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float |
         if rho is not None:
             level = rounding.max(axis=1, initial=_TINY)
             return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
-        known = knowledge(matrices, *_beside(regression, at, tol), rounding)
+        known = knowledge(matrices, *_beside(regression, at), tol, rounding)
         return known.smallest, known.rounding
 
     smallest, level = (np.concatenate(each) for each in zip(*(

@@ -190,9 +190,8 @@ def knowledge(
     and the diagonal of G is good to a ``rounding`` (M, p).
     """
     p = gram.shape[1]
-    energy = np.maximum(np.einsum("mjj->mj", gram[..., :p]), _TINY**2)
-    sizes, level = _sizes(np.sqrt(energy), terms, elapsed, tol)
-    level = np.maximum(level, np.minimum(rounding / energy, 1.0))
+    energy = np.einsum("mjj->mj", gram[..., :p])
+    sizes, level = own_sizes(energy, terms, elapsed, tol, rounding)
     factors = np.where(level < 1.0, 1.0 / sizes, 0.0)
     spectrum, vectors = np.linalg.eigh(
         gram[..., :p] * factors[:, :, None] * factors[:, None, :]
@@ -208,7 +207,20 @@ def knowledge_of_roots(root: Array, terms: Array, elapsed: Array, tol: float = 1
     return Knowledge(sizes, sigma[:, ::-1] ** 2, np.swapaxes(Vt, 1, 2)[:, :, ::-1], level)
 
 
-def _sizes(sizes: Array, terms: Array, elapsed: Array, tol: float) -> tuple[Array, Array]:
+def own_sizes(
+    energy: Array, terms: Array | float, elapsed: Array, tol: float = 1e-12,
+    rounding: Array | float = 0.0,
+) -> tuple[Array, Array]:
+    """√G_jj (M, p), or the size of its terms where a column is rounding; which share is rounding.
+
+    The ``energy`` is G_jj (M, p); the other arguments are those of :func:`knowledge`.
+    """
+    energy = np.maximum(energy, _TINY**2)
+    sizes, level = _sizes(np.sqrt(energy), terms, elapsed, tol)
+    return sizes, np.maximum(level, np.minimum(rounding / energy, 1.0))
+
+
+def _sizes(sizes: Array, terms: Array | float, elapsed: Array, tol: float) -> tuple[Array, Array]:
     """√G_jj and the levels of columns, from what their rounding would amount to.
 
     A column that is rounding has the size of its terms: what is small beside those is so in x, too.

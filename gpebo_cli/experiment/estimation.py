@@ -105,11 +105,10 @@ def continuous(
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
         estimator = estimators.tuned(estimator, regression)
         try:
-            used, estimation, metrics = _estimate(
+            estimation, metrics = _estimate(
                 settings, system, observation.estimator or estimator, observation, source, known,
                 seen[-1], pace,
             )
-            estimator = estimator if observation.estimator else used
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     why = ""
@@ -265,9 +264,6 @@ def at_samples(
                 estimator, lambda one: fed(one, columns, last=False)[0].requirement
             )
             online, made = fed(by, columns, last=True)
-            raised = estimators.raised(by, online.requirement)
-            if raised is not by:
-                online, made = fed(raised, columns, last=True)
             return online, joined(made)
 
         online, made = estimated(None)
@@ -340,12 +336,11 @@ def _held(samples: Sampling, metrics: Metrics) -> str:
 def _estimate(
     settings: Settings, system: DescriptorSystem, estimator: estimators.Estimator,
     observation: Observation, source: Source, known: Knowledge, seen: BoolArray, pace: Pace,
-) -> tuple[estimators.Estimator, EstimationResult, Metrics]:
+) -> tuple[EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both.
 
-    The first result is the estimator with the gains that were used. What is not determined at the
-    end is NaN. If the estimator is not the observer's own and has nothing to carry over resets, the
-    parameters that others can stand for are left out.
+    What is not determined at the end is NaN. If the estimator is not the observer's own and has
+    nothing to carry over resets, the parameters that others can stand for are left out.
     """
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
@@ -366,10 +361,6 @@ def _estimate(
     seen = seen if about_own else np.ones(n, dtype=bool)
     about = observation, grid, kept, known.independent
     estimates, columns = _estimates(estimator, *about)
-    if observation.estimator is None:
-        raised = estimators.raised(estimator, estimates.requirement)
-        if raised is not estimator:
-            estimator, (estimates, columns) = raised, _estimates(raised, *about)
     requirement = estimates.requirement
     if observation.bounds:
         estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
@@ -407,7 +398,7 @@ def _estimate(
         )) if about_own and _one_fit(observation) else ({}, ()),
         still=doubts.still(parameters, requirement, natural),
     )
-    return estimator, result, accuracy.metrics_of(numbers, observation.parameters, system)
+    return result, accuracy.metrics_of(numbers, observation.parameters, system)
 
 
 def _doubts(

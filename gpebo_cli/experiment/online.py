@@ -137,7 +137,8 @@ class Online:
         self.fits = block.fit is not None
         columns, p = self._columns, len(self.parameters)
         rows = block.regression.rows[..., [*columns, p]]
-        some = replace(block.regression, rows=rows)
+        scale = np.asarray(block.regression.scale)
+        some = replace(block.regression, rows=rows, scale=scale[..., columns])
         made = self._recursion.update(some)
         eta = np.zeros((*made.parameters.shape[:2], p))
         eta[..., columns] = made.parameters
@@ -146,7 +147,7 @@ class Online:
         self.root, self.count = roots[-1], self.count + len(t)
         S = roots[:, :p, :p]
         sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)
-        known = knowledge_of_roots(S, block.scale, t - self.start, self._tol)
+        known = knowledge_of_roots(S, scale, t - self.start, self._tol)
         smallest = sigma.min(axis=1, initial=np.inf) ** 2
         if self._rho is None:
             reached = known.margin >= 1.0, (known.margin >= 1.0) & (known.smallest >= WELL)

@@ -297,7 +297,6 @@ class SampledBlock:
     offset: Array  # (K, n)
     gain: Array  # (K, n, p) x = offset + gain η
     extension: Array  # (K, k, 1 + p) [ξ_a | ξ_b | Φ]
-    scale: Array  # (K, p) of the terms of each column of ψ so far
     errors: ErrorSteps | None = None  # how errors of [u; y] become those of Y and of the offset
     units: Array | None = None  # (n,) as of ``AffineStateMap``
     fit: Fit | None = None  # where the state is not affine in η: instead of offset and gain

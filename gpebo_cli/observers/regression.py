@@ -117,7 +117,7 @@ class GivenAtSamples:
         self, state: TextState | None, t: Array, u: Array, y: Array
     ) -> tuple[TextState, SampledBlock]:
         """Regression at the samples t (K,) of u (K, m), and y (K, rows) where the text has no Y."""
-        state, regression, scale = self.text.advance(self.hold, state, t, u, y)
+        state, regression = self.text.advance(self.hold, state, t, u, y)
         count, S = len(t), self.text.parametrisation
         none = np.zeros((count, self.text.system.n, len(self.parameters)))
         errors = None
@@ -127,7 +127,7 @@ class GivenAtSamples:
             errors = ErrorSteps(np.zeros((count, 0, 2 * o.D.shape[2])), *whole)
 
         return state, SampledBlock(
-            regression, none[:, :, 0], none, none[:, :0], scale, errors,
+            regression, none[:, :, 0], none, none[:, :0], errors,
             fit=None if S is None else S.fit,
         )
 

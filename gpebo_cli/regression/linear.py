@@ -158,6 +158,11 @@ class LinearRegression:
                 rounding[some] = interpolation_error(part, k, share)
         return found, rounding
 
+    def terms(self, t: Array) -> Array:
+        """The ``scale`` so far at the times t (N,), (N, p)."""
+        sizes = np.broadcast_to(self.scale, (self.mesh.size, self.p))
+        return np.asarray(sizes[self.mesh.edges[1:-1].searchsorted(t, side="left")])
+
     def rounding_of(self, gram: Array) -> Array:
         """What of the diagonal of G (M, p, p + c) filters of moving parameters leave, (M, p).
 

@@ -41,6 +41,7 @@ class ExtensionState:
     memory: float = 1.0  # z of least squares with forgetting
     surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
     energy: float = 0.0  # ∫Δ² of a law behind it since it began
+    began: float = 0.0  # when data were first gathered
     turned: Array = field(default_factory=lambda: np.zeros((2, 0)))  # (2, 1 + p) [Φ | e]
 
     def after(self, reset: Reset) -> ExtensionState:

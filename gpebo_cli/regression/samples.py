@@ -28,6 +28,7 @@ class SampledRegression:
     rows: Array  # (K + 1, rows, p + 1) [ψ | Y], first that of the sample before (the first: itself)
     hold: str  # zoh or linear
     parametrisation: Parametrisation | None = None
+    scale: Array | float = 0.0  # (K, p) sizes of the terms of each column of ψ so far
 
     @property
     def p(self) -> int:

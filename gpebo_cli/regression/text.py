@@ -216,12 +216,12 @@ class TextRegression:
 
     def advance(
         self, hold: str, state: TextState | None, t: Array, signals: Array, Y: Array
-    ) -> tuple[TextState, SampledRegression, Array]:
+    ) -> tuple[TextState, SampledRegression]:
         """Carry the operators over the samples at the times t (K,), ascending, after ``state.t``.
 
         The state is None before the first sample; signals are (K, m), and Y (K, rows), which is not
-        looked at where the text has one. What comes is where it stands, the regression at the
-        samples, and the scale of ψ's columns (K, p) so far.
+        looked at where the text has one. What comes is where it stands, and the regression
+        at the samples.
         """
         reached: list[OperatorState] = []
 
@@ -243,9 +243,9 @@ class TextRegression:
         last, row = (t[0], rows[0]) if state is None else (state.t, state.row)
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([row[None], rows]), hold,
-            self.parametrisation,
+            self.parametrisation, scale,
         )
-        return TextState(float(t[-1]), tuple(reached), rows[-1], scale[-1]), regression, scale
+        return TextState(float(t[-1]), tuple(reached), rows[-1], scale[-1]), regression
 
 
 class _Operators:

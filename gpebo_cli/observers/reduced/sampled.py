@@ -184,7 +184,8 @@ class SampledObserver(Formulation):
             scale[-1], growth, smallest, error,
         )
         regression = SampledRegression(
-            t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold
+            t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold,
+            scale=scale,
         )
         errors = None
         if step is not None:
@@ -195,7 +196,7 @@ class SampledObserver(Formulation):
             ))
         resolve(assembled, slice(None), of_gain(), self.form)
         return state, SampledBlock(
-            regression, assembled.offset, assembled.gain, z, scale, errors, self.form.units.states
+            regression, assembled.offset, assembled.gain, z, errors, self.form.units.states
         )
 
 
