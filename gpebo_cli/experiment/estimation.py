@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,13 @@ from gpebo_cli.experiment.memory import check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.pace import Pace
-from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
+from gpebo_cli.experiment.result import (
+    EstimationResult,
+    Fit,
+    NoiseStatistics,
+    RegressionResult,
+    RunResult,
+)
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
@@ -145,7 +150,9 @@ def continuous(
 def _completed(
     result: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
     excitation: Excitation, estimation: EstimationResult, metrics: Metrics, gains: Array | None,
-    note: str, *, noisy: bool, **more: Any,
+    note: str, *, noisy: bool, regression: RegressionResult, fit: Fit | None, settings: Settings,
+    estimable: Callable[[], Mapping[str, float | None]], noise: NoiseStatistics | None = None,
+    left_out: tuple[str, ...] = (),
 ) -> RunResult:
     """The result with what observer and estimator made of a source, and what is told of it.
 
@@ -154,19 +161,20 @@ def _completed(
     """
     system, simulation, recording = result.system, result.simulation, result.recording
     if noisy:
-        metrics = accuracy.standing(estimation, metrics, gains, system, more.get("noise"))
+        metrics = accuracy.standing(estimation, metrics, gains, system, noise)
     # A result that is kept for what it has to tell must not keep what the observer made.
     of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
     of_observer = partial(of_observation, observed.assumptions, growth, excitation, system)
     warned, told = warnings(observed), partial(
-        verdict, excitation, estimation.cases, estimation.requirement, metrics, more["fit"],
-        unknown, more.get("left_out", ()), estimation.active,
+        verdict, excitation, estimation.cases, estimation.requirement, metrics, fit, unknown,
+        left_out, estimation.active,
     )
     notes = observed.note + note + simulation_note(simulation, result.settings.solver.tol)
     notes += functions_note(system, simulation or recording)
     notes += recording.note if recording else ""
     return replace(  # once: a copy asks for everything that is not replaced
-        result, excitation=excitation, estimation=estimation, metrics=metrics, **more,
+        result, excitation=excitation, estimation=estimation, metrics=metrics, settings=settings,
+        regression=regression, fit=fit, noise=noise, left_out=left_out, estimable=estimable,
         assumptions=lambda: (*of_source(), *of_observer()),
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
         warnings=lambda: (*warned, *estimation.warnings),
@@ -307,7 +315,8 @@ def at_samples(
     return _completed(
         result, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
-        _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy, estimable=times,
+        _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy,
+        estimable=lambda: times, settings=settings,
         regression=RegressionResult(
             t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
         ),
