@@ -43,22 +43,23 @@ class _Gain:
     accept: Accepted
     by_parameter: bool
     auto: bool
-    default: float
+    default: float | None
+    relative: float | None
 
 
 def gain(
-    default: float, accept: Accepted = "positive", *, by_parameter: bool = False,
-    auto: bool = False, relative: bool = False,
+    default: float | None, accept: Accepted = "positive", *, by_parameter: bool = False,
+    auto: bool = False, relative: float | None = None,
 ) -> Any:
     """A field of an estimator that is a gain: a number, a list, or ``logspace(a, b, n)``.
 
     It may be ``by_parameter``, a mapping which makes one case; ``auto``, which
     :meth:`GainEstimator.tuned` replaces: the larger the gain the faster, and the requirement says
-    which one is the least; ``relative``: where nothing was said (None) the default is one without a
-    unit, relative to something of the data so far, and no case names it.
+    which one is the least; ``relative``: None stands for this one without a unit, relative to
+    something of the data so far, and no case names it.
     """
-    declared = _Gain(accept, by_parameter, auto, default)
-    return field(default=None if relative else default, metadata={"gain": declared})
+    declared = _Gain(accept, by_parameter, auto, default, relative)
+    return field(default=default, metadata={"gain": declared})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +89,7 @@ class GainEstimator(ABC):
             elif declared.auto and is_auto(value):
                 axes[own.name] = (float("nan"),)
             elif value is None:
-                if own.default is not None:
+                if declared.relative is None:
                     axes[own.name] = (declared.default,)
             else:
                 axes[own.name] = axis(value, where, declared.accept)
@@ -121,7 +122,8 @@ class GainEstimator(ABC):
         """
         value, where = getattr(self, name), f"estimator.{name}"
         if value is None:
-            value = type(self).__dataclass_fields__[name].metadata["gain"].default
+            declared = type(self).__dataclass_fields__[name].metadata["gain"]
+            value = declared.default if declared.relative is None else declared.relative
         if is_auto(value):
             raise ConfigError(
                 f"{where}: auto needs to know the signals to their end; give a number with resets "

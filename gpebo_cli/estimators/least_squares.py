@@ -53,7 +53,7 @@ class LeastSquares(ResumableEstimator):
     """
 
     alpha: object = gain(1.0)
-    f0: object = gain(1.0, relative=True)
+    f0: object = gain(1e-6, relative=1.0)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
 

@@ -57,10 +57,10 @@ class LsDrem(ResumableEstimator):
     """
 
     alpha: object = gain(1.0)
-    f0: object = gain(1.0, relative=True)
+    f0: object = gain(None, relative=1.0)
     beta: object = gain(0.0, "nonnegative")
     bound: object = None
-    gamma: object = gain(50.0, by_parameter=True, auto=True, relative=True)
+    gamma: object = gain(None, by_parameter=True, auto=True, relative=50.0)
 
     def __post_init__(self) -> None:
         """A γ has a unit, and so has the f₀ beside it."""
