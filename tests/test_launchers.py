@@ -211,8 +211,6 @@ def test_a_launcher_that_is_not_installed_is_one_line_with_the_extra(tmp_path):
     assert_refused(done, "pip install 'gpebo[ray]'")
 
 
-
-
 BLOCKED = """
 import signal
 from joblib.externals.loky.backend import resource_tracker

@@ -432,7 +432,6 @@ def test_many_seeds_are_one_run_per_seed_with_every_remedy(remedy):
     np.testing.assert_allclose(found.deviation, errors.std(axis=0, ddof=1), rtol=1e-4, atol=1e-7)
 
 
-
 @pytest.mark.parametrize("remedy", ["output_injection", "reset", "current_coordinates"])
 def test_remedies_bear_noise_and_weights(remedy):
     """The error of the state stays near the noise, where without a remedy it grows with Φ."""

@@ -49,7 +49,6 @@ _KEYS = (
 )
 
 
-
 @dataclass(frozen=True)
 class Arguments:
     """What ``gpebo run`` was asked to do."""
@@ -154,7 +153,6 @@ def _stored(word: str) -> str:
     if match[1] not in LOOK:
         raise unknown(f"figures.{match[1]}: no such key", match[1], LOOK, "figures has")
     return word.replace("figures.", "output.", 1)
-
 
 
 def _with_regression(overrides: list[str]) -> tuple[str, ...]:

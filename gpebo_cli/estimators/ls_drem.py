@@ -88,7 +88,7 @@ class LsDrem(ResumableEstimator):
             rate = s.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
             delta, weights = _adjugate(s, case["alpha"], f0_of(case))
             if self.gamma is None:
-                gain = gain * _pace(info.began, case["beta"], t)[:, None]
+                gain = gain * one_over_memory(t, case["beta"], info.began)[:, None]
             adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
             rates = np.broadcast_to(rate[:, None], weights.shape)
             return scalar_errors(rates, into, delta, adjugate, gain)
@@ -112,7 +112,8 @@ class LsDrem(ResumableEstimator):
         groups = tuple(
             mix_least_squares(
                 info, case["alpha"], f0_of(case), t, regression.floor,
-                partial(_pace, info.began, case["beta"]) if self.gamma is None else None,
+                partial(one_over_memory, beta=case["beta"], began=info.began)
+                if self.gamma is None else None,
             )
             for info, case in zip(infos, part.cases, strict=True)
         )
@@ -121,14 +122,10 @@ class LsDrem(ResumableEstimator):
         )
 
 
-def one_over_memory(elapsed: Array, beta: float) -> Array:
-    """1/∫ e^{−β(t−s)} ds over the time since data were first gathered, (N,)."""
-    elapsed = np.maximum(elapsed, _NO_TIME)
+def one_over_memory(t: Array, beta: float, began: float = 0.0) -> Array:
+    """1/∫ e^{−β(t−s)} ds at the times t (N,), from when data were first gathered, in 1/s."""
+    elapsed = np.maximum(t - began, _NO_TIME)
     return np.asarray(beta / -np.expm1(-beta * elapsed) if beta else 1.0 / elapsed)
-
-
-def _pace(began: float, beta: float, t: Array) -> Array:
-    return one_over_memory(t - began, beta)
 
 
 def _mixed(

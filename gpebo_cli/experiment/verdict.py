@@ -189,7 +189,6 @@ def functions_note(
     return f"; nothing bounds what {which} do between the times at which they are evaluated"
 
 
-
 def _best_case(metrics: Metrics) -> int | None:
     """The first case below 1 % for good; if there is none, the one with the least final error.
 

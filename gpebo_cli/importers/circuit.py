@@ -128,7 +128,6 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
 
 
-
 def _loops(branches: Sequence[Element]) -> Iterable[tuple[str, ...]]:
     """One loop of capacitors and sources for every voltage source that is in one."""
     inside = [e for e in branches if e.kind in "CVEH"]

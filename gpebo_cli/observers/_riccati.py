@@ -97,7 +97,6 @@ def pair(P: Array, estimate: Array) -> Array:
     return out
 
 
-
 @dataclass(frozen=True, eq=False)
 class Filtered:
     """The filter's covariance and estimates on the mesh that resolves them."""

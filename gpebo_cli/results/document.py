@@ -124,7 +124,6 @@ def _assumptions(summary: Mapping[str, Any]) -> str:
     return html.table(rows, text=True, failed=failed) if found else ""
 
 
-
 def _pairs(section: object) -> str:
     if not isinstance(section, Mapping):
         return ""

@@ -378,7 +378,6 @@ def _shown_cases(estimation: EstimationResult) -> list[int]:
     return [int(case) for case in np.linspace(0, count - 1, min(count, MAX_CASES)).round()]
 
 
-
 def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:
     """Those of the states ``members`` that the observer sees: not all of their estimates NaN."""
     return [i for i in members if not np.isnan(estimation.states[:, :, i]).all()]

@@ -55,7 +55,6 @@ def paragraph(text: str, kind: str = "") -> str:
     return f"<p{f' class={kind}' if kind else ''}>{escape(text)}</p>\n" if text else ""
 
 
-
 def embedded_figure(png: bytes, name: str) -> str:
     """A picture in the page itself; a click shows it as large as the page."""
     caption = escape(name.replace("_", " "))

@@ -112,7 +112,6 @@ def clear(folder: Path, numbers: Sequence[int]) -> None:
         remove_files([inside / RESULT, *inside.glob(".*.tmp")])
 
 
-
 def table(records: Sequence[JobRecord]) -> list[list[str]]:
     """Header and rows of ``results.csv``; a job that is not done has one row, and no case."""
     keys = list(dict.fromkeys(k for record in records for k in record.overrides))

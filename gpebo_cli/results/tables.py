@@ -193,7 +193,6 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
     write_text(path, csv_text(rows))
 
 
-
 def rows_text(table: Array, first: str = "%.17g") -> Iterator[bytes]:
     """A table (rows, columns) as CSV, its first column in a format of its own; NaN is empty."""
     line = ",".join([first] + ["%.17g"] * (table.shape[1] - 1)) + "\n"
