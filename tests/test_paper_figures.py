@@ -24,8 +24,8 @@ from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import circuit, gallery
 from gpebo_cli.results.figures import describe, overlay
+from gpebo_cli.results.gallery import STUDIES
 from gpebo_cli.results.series import blocks, blocks_text, differences, reference_text
-from gpebo_cli.results.studies import STUDIES
 from gpebo_cli.results.style import TIME, Axis, Curve, Panel, compose, line
 from gpebo_cli.settings import Settings
 

@@ -39,11 +39,10 @@ def main(words: list[str]) -> int:
     from gpebo_cli.results import circuit, gallery
     from gpebo_cli.results.files import make_folder, write_text
     from gpebo_cli.results.provenance import provenance
-    from gpebo_cli.results.studies import PAPERS, STUDIES
 
     folder = Path(options.values.get("--output", _OUTPUT))
-    names = names or list(STUDIES)
-    if PAPERS in names and not circuit.available():
+    names = names or list(gallery.STUDIES)
+    if gallery.PAPERS in names and not circuit.available():
         sys.stderr.write("Fig. 1 is left out: it needs schemdraw, pip install 'gpebo[figures]'\n")
     make_folder(folder)
     sections: list[Section] = []

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 from gpebo_cli.cli.progress import display
 from gpebo_cli.results.names import shown_metrics
-from gpebo_cli.results.sweep_folder import RESULT, JobRecord, Plan, job_folder, read_record
+from gpebo_cli.results.sweep_folder import RESULT, JobRecord, Plan, read_record
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -60,7 +60,7 @@ class Watch:
     def _look(self) -> RenderableType:
         from rich.console import Group
 
-        there = [n for n in self._waiting if (job_folder(self._folder, n) / RESULT).exists()]
+        there = [n for n in self._waiting if (self._folder / str(n) / RESULT).exists()]
         self._ended += [read_record(self._folder, n, self._plan.jobs[n]) for n in there]
         self._waiting = [number for number in self._waiting if number not in there]
         self._bar.update(self._task, completed=len(self._plan.jobs) - len(self._waiting))

@@ -25,10 +25,9 @@ from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
 from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
 from gpebo_cli.experiment.fit import fit_of
-from gpebo_cli.experiment.memory import check_at_samples
+from gpebo_cli.experiment.limits import Pace, check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
-from gpebo_cli.experiment.pace import Pace
 from gpebo_cli.experiment.result import (
     EstimationResult,
     Fit,

@@ -17,11 +17,11 @@ import numpy as np
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.experiment import memory, several, sources
+from gpebo_cli.experiment import limits, several, sources
 from gpebo_cli.experiment.estimation import at_samples, continuous
+from gpebo_cli.experiment.limits import Pace, paced
 from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.experiment.online import Online
-from gpebo_cli.experiment.pace import Pace, paced
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
@@ -88,7 +88,7 @@ def run_experiment(
     if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
     check_seeds(settings.noise, levels, settings.time.horizon)
-    memory.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
+    limits.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     if isinstance(estimator, estimators.Fitting):
         given = system.regression
         estimator.law(given.parametrisation if isinstance(given, TextRegression) else None)

@@ -15,6 +15,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimates, estimate
+from gpebo_cli.experiment.limits import Pace
 from gpebo_cli.experiment.noise import (
     NoiseLevels,
     SampledMesh,
@@ -24,7 +25,6 @@ from gpebo_cli.experiment.noise import (
     noise_grid,
     sampled_mesh,
 )
-from gpebo_cli.experiment.pace import Pace
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory

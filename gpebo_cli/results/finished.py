@@ -19,7 +19,7 @@ from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.reading import read_bytes, strict_json
-from gpebo_cli.results.sweep_folder import PLAN, JobRecord, job_folder, read_plan, read_records
+from gpebo_cli.results.sweep_folder import PLAN, JobRecord, read_plan, read_records
 from gpebo_cli.schema import shown
 
 _NUMBER = re.compile(r"-?(?:[0-9]+(?:\.[0-9]+)?(?:e[+-]?[0-9]+)?)")
@@ -102,7 +102,7 @@ def find(name: str) -> list[Found]:
         return [found for path in inside for found in find(str(path))]
     records = read_records(folder, plan)
     done = [
-        (f"{label}/{r.job}", job_folder(folder, r.job), r.overrides)
+        (f"{label}/{r.job}", folder / str(r.job), r.overrides)
         for r in records
         if r.status == "done"
     ]

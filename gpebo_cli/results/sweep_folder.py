@@ -73,11 +73,6 @@ def read_plan(folder: Path) -> Plan | None:
         raise ConfigError(f"{folder / PLAN}: not the plan of a sweep of gpebo") from None
 
 
-def job_folder(folder: Path, number: int) -> Path:
-    """Where job ``number`` writes."""
-    return folder / str(number)
-
-
 def write_record(folder: Path, record: JobRecord) -> None:
     """Write the ``result.json`` of a job to its own ``folder``."""
     text = json.dumps(asdict(record), indent=1, ensure_ascii=False, allow_nan=False)
@@ -90,7 +85,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
     A file that is no result, or of other overrides, counts as none: the job is missing.
     """
     try:
-        with open_regular(job_folder(folder, number) / RESULT) as stream:
+        with open_regular(folder / str(number) / RESULT) as stream:
             record = read(JobRecord, strict_json(stream.read()), RESULT)
     except (ConfigError, OSError, ValueError, RecursionError):
         record = None
@@ -108,7 +103,7 @@ def clear(folder: Path, numbers: Sequence[int]) -> None:
     """Remove what earlier attempts left of these jobs and would be taken for a new result."""
     remove_files([folder / STOP])
     for number in numbers:
-        inside = job_folder(folder, number)
+        inside = folder / str(number)
         remove_files([inside / RESULT, *inside.glob(".*.tmp")])
 
 

@@ -1,8 +1,14 @@
-"""What a run will hold, estimated before it is allocated: a machine that swaps stands still."""
+"""What a run may take, of memory and of time: refused before it is spent, not after.
+
+Memory is estimated before it is allocated, for a machine that swaps stands still; how long a loop
+will take follows from how long it took so far.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import prod
+from time import process_time
 
 import numpy as np
 
@@ -12,6 +18,10 @@ from gpebo_cli.experiment.sources import kept_samples
 from gpebo_cli.model.descriptor import DescriptorSystem, differential_order
 from gpebo_cli.settings import Settings
 
+Loop = Callable[[int], None]  # told how many rounds of a loop are done
+Pace = Callable[[int, str], Loop]  # how many rounds there are, and of what
+
+_LOOK = 1.0  # seconds after which a loop is known well enough
 _HELD = 4  # arrays of every kind that are alive at once; measured
 
 
@@ -52,3 +62,25 @@ def _needs(
             elements, settings.solver.stages + 1, n**2 + regression + signals * (p + 1),
         )
     return {what: _HELD * prod(numbers) for what, numbers in needs.items()}
+
+
+def paced(count: int, what: str, limit: float, share: Callable[[float], None]) -> Loop:
+    """What a loop of ``count`` rounds calls after each part of them, with how many are done.
+
+    It refuses the loop if all of it would take longer than ``limit`` seconds of computing time
+    (ConfigError), and hands on the share that is done.
+    """
+    begin = process_time()
+
+    def _loop(done: int) -> None:
+        spent = process_time() - begin
+        needed = spent * count / done
+        if done < count and spent > _LOOK and needed > limit:
+            raise ConfigError(
+                f"{count} {what} would take some {needed:.0f} s of computing time (the first "
+                f"{done} took {spent:.1f} s), and a run may take {limit:g} s; to wait for them: "
+                f"solver.max_seconds={float(f'{2 * needed:.1g}'):.0f}"
+            )
+        share(done / count)
+
+    return _loop
