@@ -54,13 +54,18 @@ def _residual(
     values, there = values.swapaxes(2, 3), np.diff(rows) > 0  # states last: their sums are fast
     X, f = values[:, 1:], at_nodes(f, K, points - 1).swapaxes(2, 3)
     a, first = at_nodes(entries, K, points - 1), rows[:-1][there]
+
+    def sums(entries: Array, values: Array) -> Array:
+        terms = values[..., columns]
+        terms *= entries  # in place: these are as much as all else
+        return np.asarray(np.add.reduceat(terms, first, axis=-1))
+
     left = np.matmul(Dh, (X - values[:, :1]).reshape(K, points - 1, -1)).reshape(X.shape)
-    left[..., there] -= np.add.reduceat(a[:, :, None] * X[..., columns], first, axis=3)
+    left[..., there] -= sums(a[:, :, None], X)
     left[:, :, : f.shape[2]] -= f
     largest = np.abs(values).max(axis=1)
     size = np.abs(Dh).sum(axis=2).max(axis=1)[:, None, None] * largest
-    terms = np.abs(a).max(axis=1)[:, None] * largest[..., columns]
-    size[..., there] += np.add.reduceat(terms, first, axis=2)
+    size[..., there] += sums(np.abs(a).max(axis=1)[:, None], largest)
     size[:, : f.shape[2]] += np.abs(f).max(axis=1)
     return np.asarray((np.abs(left).max(axis=1) / np.maximum(size, _SMALL)).max(axis=(1, 2)))
 

@@ -32,6 +32,8 @@ _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero b
 _AT_ONCE = 64  # times, whose entries are there twice while they are copied
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
 
+_NOTHING = np.zeros((1, 1))
+
 Row = dict[int, Array]
 
 
@@ -148,15 +150,14 @@ def _at_times(values: Array, count: int, which: IntArray) -> Array:
 class _Equations:
     """Rows of entries; one becomes a mapping where it is touched."""
 
-    def __init__(self, values: Array, places: Places, known: Array, units: Array) -> None:
+    def __init__(self, values: Array, places: Places, known: Row, units: Array) -> None:
         n = len(units)
         self.values, self.order = values, np.lexsort(places[::-1])
         self.place = [place[self.order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
-        self.given = known  # (orders, N or 1, n)
+        self.known = dict(known)  # in those rows that have something
         self.units = units
-        self.rows: dict[int, Row] = {}  # those that were touched, and
-        self.known: dict[int, Array] = {}
+        self.rows: dict[int, Row] = {}  # those that were touched
         self.least = 1.0  # pivot so far, relative to its row
         by_column = np.argsort(self.place[1], kind="stable")
         self._in_column = self.place[0][by_column]
@@ -169,7 +170,6 @@ class _Equations:
             part = slice(self.first[i], self.first[i + 1])
             values = np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy()
             self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
-            self.known[i] = self.given[:, :, i].copy()
         return self.rows[i]
 
     def where(self, k: int) -> set[int]:
@@ -189,7 +189,8 @@ class _Equations:
         factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
         of_row = place[self.place[0][which]]
         self.values = _divided(self.values, self.order[which], factor[:, :, of_row])
-        self.given = _divided(self.given, rows, factor)
+        for i in self.known.keys() & set(rows.tolist()):
+            self.known[i] = product(self.known[i], factor[:, :, place[i]])
 
     def assembled(self, chosen: IntArray, states: IntArray) -> Sparse:
         """Rows ``chosen`` (d,), with columns ``states`` (d,)."""
@@ -219,10 +220,9 @@ class _Equations:
 
     def forcing(self, chosen: IntArray) -> Array:
         """What is known in the rows ``chosen`` (d,), (N or 1, d)."""
-        touched = [(p, self.known[i][0]) for p, i in enumerate(chosen.tolist()) if i in self.known]
-        count = max([self.given.shape[1], *(len(value) for _, value in touched)])
-        f = _at_times(self.given, count, chosen)
-        for p, value in touched:
+        known = [(p, self.known[i][0]) for p, i in enumerate(chosen.tolist()) if i in self.known]
+        f = np.zeros((max((len(value) for _, value in known), default=1), len(chosen)))
+        for p, value in known:
             f[:, p] = value
         return f
 
@@ -250,7 +250,20 @@ class _Equations:
         if len(into) > _FILL + len(self.units) // 4:
             raise UndecidedError
         if known is not None:
-            self.known[i] = _sum(self.known[i], product(factor, known))
+            self.tell(i, product(factor, known))
+
+    def tell(self, i: int, known: Array) -> None:
+        """Add something known to row i."""
+        self.known[i] = _sum(self.known[i], known) if i in self.known else known
+
+    def add_derivatives(self, i: int, row: Row, known: Array | None) -> None:
+        """Add Σ a_k' x_k and φ', of entries that move, to row i."""
+        for k, a in row.items():
+            if a.shape[1] > 1 or (a[1:] != 0.0).any():
+                changes = _derivative(a)
+                self.add(i, np.eye(len(changes), 1), {k: changes}, None)
+        if known is not None:
+            self.tell(i, _derivative(known))
 
     def pivot(self, i: int, allowed: Iterable[int]) -> int:
         """A state among ``allowed`` that row i can give, in as few other rows as possible."""
@@ -283,11 +296,15 @@ def scaling_of(found: Entries, n: int) -> Scaling:
     return balance_entries(np.concatenate(sizes), (np.repeat([0, 1], kind), i, j), n)
 
 
-def explicit_form(found: Entries, scaling: Scaling, f: Array) -> Explicit:
-    """Eliminate, with the model at N times and f (orders, N or 1, n) known (or UndecidedError)."""
-    n, units = f.shape[2], scaling.columns
+def explicit_form(found: Entries, scaling: Scaling, f: Row) -> Explicit:
+    """Eliminate, with the model at N times (or UndecidedError).
+
+    ``f`` are the Taylor coefficients (orders, N or 1) of what is known in those equations in
+    which there is something.
+    """
+    units = scaling.columns
     A = _Equations(found.values.A, found.places["A"], f, units)
-    E = _Equations(found.values.E, found.places["E"], np.zeros((1, 1, n)), units)
+    E = _Equations(found.values.E, found.places["E"], {}, units)
     equation_of = _leading(E, A)
     shifts = _shifted(E, A, equation_of)
     count = len(shifts)
@@ -327,12 +344,13 @@ def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
         factor = _reciprocal(E.row(i)[k])
         E.rows[i] = {j: product(factor, v) for j, v in E.row(i).items()}
         A.rows[i] = {j: product(factor, v) for j, v in A.row(i).items()}
-        A.known[i] = product(factor, A.known[i])
+        if i in A.known:
+            A.known[i] = product(factor, A.known[i])
         rest = {j: v for j, v in E.rows[i].items() if j != k}
         for other in [o for o in E.where(k) if o != i]:
             times = -E.put(other, k)
             E.add(other, times, rest, None)
-            A.add(other, times, A.rows[i], A.known[i])
+            A.add(other, times, A.rows[i], A.known.get(i))
         equation_of[k] = i
     return equation_of
 
@@ -346,12 +364,10 @@ def _shifted(
         W = {k: w for k, w in E.rows.get(i, {}).items() if k != j}
         if not W:
             continue
-        shifts.append((j, W, np.zeros((1, 1))))
+        shifts.append((j, W, _NOTHING))
         for other in list(A.where(j)):
             A.add(other, -A.row(other)[j], W, None)
-        moving = {k: _derivative(w) for k, w in W.items() if w.shape[1] > 1 or (w[1:] != 0.0).any()}
-        if moving:
-            A.add(i, np.eye(len(next(iter(moving.values()))), 1), moving, None)
+        A.add_derivatives(i, W, None)
     return shifts
 
 
@@ -376,14 +392,15 @@ def _without_others(
             c = A.pivot(i, free or A.row(i))
             for k in A.row(i):
                 A.where(k).discard(i)
-            row, known = A.row(i), A.known[i]
+            row, known = A.row(i), A.known.get(i)
             A.rows[i] = {}
             factor = _reciprocal(row.pop(c))
             row = {k: product(factor, v) for k, v in row.items()}
-            known = product(factor, known)
+            if known is not None:
+                known = product(factor, known)
             for other in list(A.where(c)):
                 A.add(other, -A.put(other, c), row, known)
-            others.append((c, row, known))
+            others.append((c, row, _NOTHING if known is None else known))
             own = level.pop(i)
             mu = max(mu, own)
             if not free:
@@ -393,15 +410,11 @@ def _without_others(
 
 
 def _differentiated(
-    A: _Equations, equation_of: dict[int, int], c: int, row: Row, known: Array
+    A: _Equations, equation_of: dict[int, int], c: int, row: Row, known: Array | None
 ) -> None:
     """The equation of x_c' becomes one without derivatives."""
     i = equation_of[c]
-    changes = _derivative(known)
-    A.row(i)
-    A.known[i] = _sum(A.known[i], changes)
-    moving = {k: _derivative(a) for k, a in row.items() if a.shape[1] > 1}
-    A.add(i, np.eye(len(changes), 1), moving, None)
+    A.add_derivatives(i, row, known)
     for k, a in row.items():
-        A.add(i, a, A.row(equation_of[k]), A.known[equation_of[k]])
+        A.add(i, a, A.row(equation_of[k]), A.known.get(equation_of[k]))
 

@@ -34,6 +34,7 @@ from gpebo_cli.reduction.constant import ConstantForm, constant_form
 from gpebo_cli.reduction.explicit import (
     Explicit,
     MoreOrdersError,
+    Row,
     UndecidedError,
     explicit_form,
     product,
@@ -61,20 +62,17 @@ _ROUNDING = 32.0  # units in the last place by which a consistent state may miss
 _TINY = float(np.finfo(float).tiny)
 
 
-def forcing(found: Entries, n: int) -> Array:
-    """Taylor coefficients (orders, N, n) of f = B u + F θ + φ."""
-    values = found.values
-    times = max(getattr(values, name).shape[1] for name in ("B", "F", "u", "theta", "phi"))
-    f = np.zeros((n, len(values.phi), times))
-    for (i,), value in found.of("phi").items():
-        f[i] = value
+def forcing(found: Entries) -> Row:
+    """Taylor coefficients (orders, N or 1) of f = B u + F θ + φ in rows that have such terms."""
+    f = {i: value for (i,), value in found.of("phi").items()}
     for matrix, vector in (("B", "u"), ("F", "theta")):
         known = found.of(vector)
         for (i, j), value in found.of(matrix).items():
             signal = known.get((j,))
             if signal is not None:
-                f[i] += product(value, signal)
-    return np.moveaxis(f, 0, 2)
+                term = product(value, signal)
+                f[i] = f[i] + term if i in f else term
+    return f
 
 
 def _placed(found: Entries, name: str, size: int) -> Array:
@@ -99,7 +97,8 @@ class _Plant:
 
     def entries(self, mesh: Mesh, every: int = 1) -> Coefficients:
         """Every entry at every so many points of each element."""
-        vars(self).pop("form", None)  # two of them would be as much again
+        for old in ("form", "found"):
+            vars(self).pop(old, None)  # two of them would be as much again
         self.at, self.eliminated = mesh if every == 1 else None, False
         t, inside = (places[:, ::every].ravel() for places in (mesh.points, mesh.inside))
         self.found = entries(self.system.coefficients, t, self.order, inside)
@@ -111,7 +110,7 @@ class _Plant:
             self.entries(mesh, every)
         while not self.eliminated:
             try:
-                self.form = self._form(self.found, forcing(self.found, self.system.n))
+                self.form = self._form(self.found, forcing(self.found))
             except MoreOrdersError:
                 if self.order == self.most:
                     raise
@@ -119,12 +118,15 @@ class _Plant:
                 self.entries(mesh, every)
             else:
                 self.eliminated, values = True, self.found.values
-                # Nothing else of A is needed now, nor of what others are parts of.
-                values = values._replace(A=largest_over_time(values.A[0])[None, None])
-                self.found = self.found._replace(values=Coefficients(*map(np.array, values)))
+                # Nothing else of E and A is needed now, nor of what others are parts of.
+                A = values.A[:1]
+                A = np.maximum(A.max(axis=1, keepdims=True), -A.min(axis=1, keepdims=True))
+                values = values._replace(E=values.E[:, :1], A=A)
+                kept = Coefficients(*(np.array(value[:1]) for value in values))
+                self.found = self.found._replace(values=kept)
         return self.form
 
-    def _form(self, found: Entries, f: Array) -> Explicit | ConstantForm:
+    def _form(self, found: Entries, f: Row) -> Explicit | ConstantForm:
         n, (E, A) = self.system.n, (getattr(found.values, name) for name in "EA")
         may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
         if self.constant is None and not (may_be_full and E.shape[2] > _ENTRIES * n):
@@ -139,7 +141,11 @@ class _Plant:
             for matrix, name, values in zip(full, "EA", (E, A), strict=True):
                 matrix[found.places[name]] = values[0, 0]
             self.constant = constant_form(full[0], full[1], self.most - 1)
-        return self.constant.along(f)
+        times = max((value.shape[1] for value in f.values()), default=1)
+        known = np.zeros((self.order + 1, times, n))
+        for i, value in f.items():
+            known[:, :, i] = value
+        return self.constant.along(known)
 
     def structure(self) -> Structure:
         """As elimination found it."""
