@@ -410,7 +410,7 @@ NOISY = {"name": "gaussian", "outputs": 0.1, "sample_time": 1.0, "seeds": 3}
 def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, settings, what):
     """With a clock that is 100 s later at every look, and one thing at a time."""
     experiment = "gpebo_cli.experiment"
-    monkeypatch.setattr(f"{experiment}.pace.process_time", itertools.count(0, 100).__next__)
+    monkeypatch.setattr(f"{experiment}.limits.process_time", itertools.count(0, 100).__next__)
     for name in ("estimation._BATCH", "estimation._SAMPLES_AT_ONCE", "seeds._NUMBERS"):
         monkeypatch.setattr(f"{experiment}.{name}", 1)
     with pytest.raises(GpeboError, match=f"^{what} would take some .*: solver.max_seconds="):
