@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Literal
 
+Between = Literal["zoh", "linear", "cubic"]  # what is assumed between samples
+
 
 def within(default: float, low: float, high: float = inf) -> Any:
     """A field whose number is refused outside of a range: beyond it nothing sensible happens."""
@@ -42,7 +44,8 @@ class DataSettings:
     name: Literal["none", "csv"] = "none"
     # CSV, Parquet or MAT; "-" is standard input, as CSV; several are experiments with the same θ.
     file: str | list[str] | None = None
-    hold: Literal["zoh", "linear", "cubic"] = "linear"  # what is assumed between samples
+    # What is assumed between samples, of all signals or by name; without one, lines.
+    hold: Between | Mapping[str, Between] = "linear"
     columns: Mapping[str, str] | None = None  # what a signal (t, V, y) is called in the file
     scale: Mapping[str, float] | None = None  # by signal: from the file's unit to ours
     time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"  # of t in the file

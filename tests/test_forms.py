@@ -423,7 +423,7 @@ def test_derivatives_of_a_signal_are_those_of_its_polynomials():
     mesh = Mesh(np.linspace(0.0, 2.0, 9), radau_rule(10))
     signal = Trajectory(mesh, np.stack([np.sin(3 * mesh.points), mesh.points**2], axis=2))
     t = np.linspace(0.05, 1.95, 41)
-    found = InputDerivatives.of_signal(signal).taylor(t, t, 2)
+    found = InputDerivatives.of_signal(signal, np.array([True, True])).taylor(t, t, 2)
     exact = [[np.sin(3 * t), t**2], [3 * np.cos(3 * t), 2 * t], [-4.5 * np.sin(3 * t), 1 + 0 * t]]
     np.testing.assert_allclose(found, np.moveaxis(exact, 1, 2), atol=1e-7)
 
@@ -489,7 +489,8 @@ def test_a_hidden_constraint_that_differentiates_an_output_is_refused(entry):
     mesh = Mesh(np.linspace(0.0, 1.0, 3), radau_rule(5))
     signal = Trajectory(mesh, np.ones((2, 6, 2)))
     seen = Measurements(
-        signal, Trajectory(mesh, np.ones((2, 6, 1))), None, InputDerivatives.of_signal(signal)
+        signal, Trajectory(mesh, np.ones((2, 6, 1))), None,
+        InputDerivatives.of_signal(signal, np.array([True, True])),
     )
     with pytest.raises(ConfigError, match="contains the derivative of the output seen, which is"):
         observe(system, seen, SOLVER)

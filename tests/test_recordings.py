@@ -24,7 +24,7 @@ from scipy.io import savemat
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.metrics import STANDING
-from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model import archive
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
@@ -184,6 +184,59 @@ def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
     np.testing.assert_allclose(trajectory(at)[:, 0], expected, atol=1e-13)
     bends = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
     assert set(bends) <= set(mesh.edges.tolist())
+
+
+STEPPED = {
+    "name": "stepped", "states": ["x"], "inputs": {"u": 1, "v": 1}, "outputs": ["y"],
+    "unknowns": {"k": 1, "drift": 1}, "E": [[1]], "A": [[0]], "B": [[0, 2]], "C": [[1]],
+    "F": [["u", -1]], "initial_state": [0],
+}
+
+
+def stepped():
+    """Rows of x' = 2.5 u − 0.4 + 2 v from 0.3 on, u held from row to row and v zero."""
+    t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.2, 200))
+    u = np.round(np.sin(0.7 * t), 1)
+    y = 0.3 + np.append(0.0, np.cumsum(np.diff(t) * (2.5 * u[:-1] - 0.4)))
+    return {"t": t - t[0], "u": u, "v": 0.0 * t, "y": y}
+
+
+def test_each_signal_may_have_its_own_hold():
+    """x is lines where u is held, whatever the steps: k and drift come out to rounding."""
+    for hold, right in ({"u": "zoh"}, True), ("linear", False), ("zoh", False):
+        found = run(STEPPED, data={"frame": pd.DataFrame(stepped()), "hold": hold},
+                    estimator={"name": "least_squares", "f0": None})
+        away = np.abs(found.details.estimation.parameters[0, -1, :2] - [2.5, 0.4]).max()
+        assert away < 1e-11 if right else away > 1e-4
+
+
+def test_so_it_may_in_a_stream():
+    rows = stepped()
+    u, y = np.column_stack([rows["u"], rows["v"]]), rows["y"][:, None]
+    settings = Settings(
+        estimator={"name": "least_squares", "f0": 1e-14}, observer={"name": "gpebo"},
+        data=DataSettings(hold={"u": "zoh"}), time=TimeSettings(np.nan, np.nan),
+    )
+    online = stream(settings, plant_from_mapping(STEPPED))(rows["t"][0], np.append(u[0], y[0]))
+    found = online.feed(rows["t"], u, y).parameters[0, -1, :2]
+    np.testing.assert_allclose(found, [2.5, 0.4], atol=1e-11)
+
+
+def test_elements_end_where_one_of_the_signals_bends():
+    """A spline beside an input that is held, and derivatives of the former alone."""
+    t = np.linspace(0.0, 4.0, 401)
+    rows = {"t": t, "u": np.floor(t), "v": np.sin(t), "y": np.cos(t)}
+    data = DataSettings("csv", frame=pd.DataFrame(rows),
+                        hold={"u": "zoh", "v": "cubic", "y": "cubic"})
+    read = load(plant_from_mapping(STEPPED), data, WHOLE, 1e-9)
+    edges = read.inputs.mesh.edges
+    assert {1.0, 2.0, 3.0} <= set(edges)
+    assert len(edges) < 60
+    at = np.linspace(0.123, 3.9, 77)
+    exact = np.column_stack([np.floor(at), np.sin(at)])
+    np.testing.assert_allclose(read.inputs(at), exact, atol=1e-8)
+    assert read.derivatives.known.tolist() == [False, True]
+    assert read.rows.hold == "cubic"
 
 
 def test_a_cut_next_to_a_sample_is_that_sample():
@@ -726,6 +779,15 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing) == ([], 0)
     assert found.doubts == ["2 cells are 9999: if that means a gap, leave them empty"]
+
+
+def test_an_input_that_steps_is_guessed_to_be_held(tmp_path):
+    """Half of its rows as the one before; gaps do not count, and a constant needs no hold."""
+    path = tmp_path / "lab.csv"
+    for V, steps in ("0 0 0 - 1 1 0 0", True), ("0 0 0 0 0 0", False), ("0 1 2 3 3 4 5 6", False):
+        rows = "".join(f"{k},{cell},1\n" for k, cell in enumerate(V.split()))
+        path.write_text(f"t,V,y\n{rows}")
+        assert guess(str(path), shipped("circuit")).held == ["V"] * steps
 
 
 def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):

@@ -40,7 +40,7 @@ from gpebo_cli.errors import ConfigError
 
 _INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
 _BETWEEN = re.compile(r",(?![^(]*\))")  # commas that are not within an expression's brackets
-_BY_SIGNAL = re.compile(r"data\.(columns|scale)\.\w+=")
+_BY_SIGNAL = re.compile(r"data\.(columns|hold|scale)\.\w+=")
 _PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 
 

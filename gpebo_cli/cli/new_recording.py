@@ -59,7 +59,8 @@ def text(file: str, plant: str, found: Guess) -> str:
         line("name", "csv"),
         line("title", f"recording of {plant}, {os.path.basename(file)}"),
         line("file", os.path.abspath(file)),
-        line("hold", "linear") + "    # between samples: zoh, linear or cubic",
+        line("hold", dict.fromkeys(found.held, "zoh") or "linear")
+        + "    # between samples: zoh, linear or cubic; of those not named linear",
         line("separator", _WORDS.get(found.separator, found.separator)),
         line("decimal", found.decimal, reasons.get("decimal", "")),
         line("time_unit", found.time_unit, reasons.get("time_unit", "")),

@@ -287,22 +287,22 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     ), axis=3)
 
 
-def error_steps(mesh: Mesh, times: Array, hold: str, A: Array, B: Array) -> Array:
+def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) -> Array:
     """ζ at each time but the first from that before and from the errors e at both, (K, k, k + 2 c).
 
-    Of elements between the times (K + 1,) of samples; between them e is held or linear. Of ζ' = A ζ
-    + B e, A (elements or 1, s + 1 or 1, k, k) and B (…, k, c) are at the points of the mesh.
+    Of elements between the times (K + 1,) of samples; between them e is linear where ``lines``
+    (c,), else held. Of ζ' = A ζ + B e, A (elements or 1, s + 1 or 1, k, k) and B (…, k, c) are at
+    the points of the mesh.
     """
     points = mesh.points[:, 1:]
     after = np.searchsorted(times, mesh.edges[1:] - 0.5 * mesh.steps)  # whose step it is part of
-    share = np.zeros(points.shape)  # of the newer of both errors
-    if hold == "linear":
-        share = (points - times[after - 1, None]) / (times[after] - times[after - 1])[:, None]
+    # Of the newer of both errors.
+    share = (points - times[after - 1, None]) / (times[after] - times[after - 1])[:, None]
     A, B = (
         np.broadcast_to(each[:, -mesh.rule.stages :], (*points.shape, *each.shape[2:]))
         for each in (A, B)
     )
-    share = share[..., None, None]
+    share = share[..., None, None] * lines
     ends = _maps(mesh, mesh.steps, A, np.concatenate([(1.0 - share) * B, share * B], axis=3))[:, -1]
     if len(ends) == len(times) - 1:
         return ends

@@ -23,6 +23,7 @@ from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
+from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
@@ -89,7 +90,7 @@ class Online:
     """An observer with its estimator, from one sample to the next."""
 
     def __init__(
-        self, settings: Settings, system: DescriptorSystem, hold: str, start: float, sample: Array,
+        self, settings: Settings, system: DescriptorSystem, hold: Hold, start: float, sample: Array,
         estimator: estimators.Estimator | None = None,
         deviations: SampledDeviations | None = None,
         derivatives: InputDerivatives | None = None,

@@ -29,6 +29,7 @@ from gpebo_cli.experiment.verdict import functions_note, verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
+from gpebo_cli.recordings.hold import holds
 from gpebo_cli.regression.text import TextRegression
 from gpebo_cli.settings import Settings
 
@@ -135,7 +136,7 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
         levels = noise_levels(settings.noise, system)
         deviations = sampled_deviations(settings.noise, levels, None)
     return lambda start, sample: Online(
-        settings, system, settings.data.hold, start, sample, estimator, deviations
+        settings, system, holds(settings.data.hold, system), start, sample, estimator, deviations
     )
 
 

@@ -70,7 +70,7 @@ class RecordingResult(SignalsResult):
     file: str
     sha256: str
     rows: int
-    hold: str
+    hold: str | Mapping[str, str]  # as data.hold says it
     first: float  # times of its first and last sample
     last: float
     known_states: tuple[str, ...]

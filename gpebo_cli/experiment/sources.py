@@ -20,6 +20,7 @@ from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Sampling, build, sampling
+from gpebo_cli.recordings.hold import each_of, holds
 from gpebo_cli.recordings.load import load
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.text import simulation_of
@@ -108,7 +109,7 @@ def recorded(
         rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
             **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
-            rows=len(samples_t), hold=recording.hold,
+            rows=len(samples_t), hold=settings.data.hold,
             first=float(samples_t[0]), last=float(samples_t[-1]),
             known_states=tuple(system.states[i] for i in table.header.known),
             elements=recording.inputs.mesh.size, bounded=recording.bounded,
@@ -154,7 +155,7 @@ def check_stream(settings: Settings, system: DescriptorSystem) -> None:
     ConfigError: names the key and what it may be.
     """
     _refuse_made_up(settings, noise_levels(settings.noise, system))
-    if settings.data.hold == "cubic":
+    if "cubic" in each_of(holds(settings.data.hold, system), 1):
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
         )

@@ -19,6 +19,7 @@ from gpebo_cli.model.expressions import on_their_side
 from gpebo_cli.model.text import switching
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
 from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps
 from gpebo_cli.regression.estimator import Estimator
@@ -377,7 +378,7 @@ class AtSamples(Observer, Protocol):
         """The samples at which it was asked to run; None if it runs in continuous time."""
 
     def at_samples(
-        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
+        self, system: DescriptorSystem, solver: SolverSettings, hold: Hold, start: float,
         sample: Array, derivatives: InputDerivatives | None,
     ) -> Recursion:
         """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``.

@@ -22,6 +22,7 @@ from gpebo_cli.observers.reduced.system import SMALL, reduced_system
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import SolverSettings
 
@@ -155,7 +156,7 @@ class Gpebo:
         return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
 
     def at_samples(
-        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,
+        self, system: DescriptorSystem, solver: SolverSettings, hold: Hold, start: float,
         sample: Array, derivatives: InputDerivatives | None,
     ) -> SampledObserver:
         """The observer in discrete time, whose first sample [u; y] (m + r,) is at ``start``."""

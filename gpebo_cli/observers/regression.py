@@ -21,6 +21,7 @@ from gpebo_cli.observers._base import (
     StateMap,
     Truth,
 )
+from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
@@ -76,10 +77,17 @@ class Given:
         return None if self.sample_time is None else Sampling(self.sample_time, self.hold)
 
     def at_samples(
-        self, system: DescriptorSystem, solver: SolverSettings, hold: str, start: float,  # noqa: ARG002  protocol
+        self, system: DescriptorSystem, solver: SolverSettings, hold: Hold, start: float,  # noqa: ARG002  protocol
         sample: Array, derivatives: InputDerivatives | None,  # noqa: ARG002
     ) -> GivenAtSamples:
-        """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``."""
+        """The regression's recursion, whose first sample [u; y] (m + r,) is at ``start``.
+
+        Its operators know one hold (ConfigError: several).
+        """
+        if not isinstance(hold, str):
+            raise ConfigError(
+                "data.hold: in a stream a regression without a plant takes one word for all signals"
+            )
         return GivenAtSamples(_text_of(system), hold)
 
 

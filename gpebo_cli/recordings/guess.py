@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from math import isnan, pi
+from operator import ne
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
@@ -34,6 +35,7 @@ _OTHER = {"l": (1e-3, "m3"), "L": (1e-3, "m3"), "bar": (1e5, "Pa"), "deg": (pi /
 _TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "datum", "temps", "tiempo")
 _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
           "h": "h", "hours": "h"}
+_STEPS = 0.5  # of its rows: an input that changes at so many of them may be one that steps
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _LOOKED_AT = 50  # rows below the header
 _NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have nothing
@@ -47,6 +49,7 @@ class Guess:
     decimal: str = "."
     time_unit: str = "s"  # as data.time_unit has it
     columns: dict[str, str] = field(default_factory=dict)  # what each signal is called in the file
+    held: list[str] = field(default_factory=list)  # inputs that stay where they are for some rows
     scale: dict[str, float] = field(default_factory=dict)  # from the file's units to the plant's
     missing: int = 0  # cells that are empty in the columns that are read, or hold one of
     gaps: list[float] = field(default_factory=list)  # nines alone, far from all other numbers
@@ -78,6 +81,12 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
     every = list(csv.reader(lines[1:], delimiter=found.separator))
+    for name in system.inputs:
+        k = header.index(found.columns[name]) if name in found.columns else len(header)
+        known = [row[k] for row in every if k < len(row) and row[k].strip().lower() not in MISSING]
+        steps = sum(map(ne, known, known[1:]))
+        if 0 < steps <= _STEPS * len(known):
+            found.held.append(name)
     for k in taken:
         _find_gaps([row[k].strip() for row in every if k < len(row)], found)
     unused = [name for name in header if name not in found.columns.values()]

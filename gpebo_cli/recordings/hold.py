@@ -5,20 +5,26 @@
 * linear: samples are joined by straight lines; order 2.
 * cubic: the C² spline through the samples (not-a-knot ends); order 4. It is wrong for noise and
   jumps.
+
+A signal each may have its own: an input that a controller puts out is held, measured outputs are
+joined by lines.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource
+from gpebo_cli.errors import printable
+from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
+from gpebo_cli.schema import unknown
 
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
 Held = Callable[[Array, Array], Array]
+Hold = str | tuple[str, ...]  # of all signals, or of each its own
 
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
 _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
@@ -27,8 +33,49 @@ _SAME = 1e-13  # slopes that differ by less than this share of the signal's size
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
 
 
-def held(t: Array, values: Array, hold: str) -> Held:
+def holds(given: str | Mapping[str, str], system: DescriptorSystem) -> Hold:
+    """That of [u; y] (m + r,), lines where ``data.hold`` says nothing (ConfigError: no signal)."""
+    if isinstance(given, str):
+        return given
+    names = (*system.inputs, *system.outputs)
+    for name in given:
+        if name not in names:
+            what = f"data.hold.{printable(name)}: plant {system.name} has no such signal"
+            raise unknown(what, name, names, "those are")
+    words = tuple(given.get(name, "linear") for name in names)
+    return words if len(set(words)) > 1 else words[0]
+
+
+def each_of(hold: Hold, count: int) -> tuple[str, ...]:
+    """That of each of so many signals."""
+    return (hold,) * count if isinstance(hold, str) else hold
+
+
+def of_outputs(hold: Hold, m: int) -> str:
+    """What is assumed of outputs behind m inputs; linear, if that is not the same of all."""
+    found = {hold} if isinstance(hold, str) else set(hold[m:])
+    return found.pop() if len(found) == 1 else "linear"
+
+
+def _kinds(hold: Hold, count: int) -> dict[str, list[int]]:
+    """Which of so many signals are held how."""
+    words = each_of(hold, count)
+    return {word: [j for j in range(count) if words[j] == word] for word in dict.fromkeys(words)}
+
+
+def held(t: Array, values: Array, hold: Hold) -> Held:
     """The signals between the samples ``values`` (N, c) at the times ``t`` (N,)."""
+    if not isinstance(hold, str):
+        parts = [(own, held(t, values[:, own], word))
+                 for word, own in _kinds(hold, values.shape[1]).items()]
+
+        def each(at: Array, inside: Array) -> Array:
+            out = np.empty((len(at), len(hold)))
+            for own, signal in parts:
+                out[:, own] = signal(at, inside)
+            return out
+
+        return each
     if hold == "cubic":
         from scipy.interpolate import CubicSpline  # a quarter of a second to import
 
@@ -62,7 +109,7 @@ def edges(t: Array, cuts: Array) -> Array:
 
 
 def recording_mesh(
-    t: Array, values: Array, hold: str, span: tuple[float, float], source: CoefficientSource,
+    t: Array, values: Array, hold: Hold, span: tuple[float, float], source: CoefficientSource,
     tol: float,
 ) -> Mesh:
     """A mesh on which held samples (N, c) at t (N,) and the plant's matrices are resolved.
@@ -74,13 +121,18 @@ def recording_mesh(
     start, stop = span
     inner = (t > start) & (t < stop)
     cuts = source.breakpoints(start, stop)
-    signal = held(t, values, hold)
+    signal, kinds = held(t, values, hold), _kinds(hold, values.shape[1])
+    smooth, bent = values[:, kinds.pop("cubic", [])], np.zeros(len(t), dtype=bool)
+    for word, own in kinds.items():
+        bent |= bends(t, values[:, own], word)
+    corners = np.concatenate([[start], t[inner & bent], [stop]])
+    spline = held(t, smooth, "cubic") if smooth.size else None
     candidates = []
     for rule in map(radau_rule, _STAGES):
-        if hold == "cubic":
-            knots = _merged(signal, np.concatenate([[start], t[inner], [stop]]), rule, tol)
-        else:
-            knots = np.concatenate([[start], t[inner & bends(t, values, hold)], [stop]])
+        knots = corners
+        if spline is not None:
+            every = np.concatenate([[start], t[inner], [stop]])
+            knots = np.union1d(knots, _merged(spline, every, rule, tol))
         coarse = Mesh(edges(knots, cuts), rule)
         equal = np.rint(_FIRST_ELEMENTS * coarse.steps / (stop - start)).astype(np.intp)
         mesh, _ = coarse.split(np.maximum(1, equal))
@@ -90,7 +142,7 @@ def recording_mesh(
 
 
 def bends(t: Array, values: Array, hold: str) -> BoolArray:
-    """Samples at which the held signal jumps or has a kink, (N,)."""
+    """Samples at which the held signal, zoh or linear, jumps or has a kink, (N,)."""
     change = np.diff(values, axis=0)
     if hold == "linear":
         step = np.diff(t)[:, None]

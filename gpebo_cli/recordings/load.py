@@ -13,7 +13,7 @@ from gpebo_cli.model.text import FollowsSignals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
-from gpebo_cli.recordings.hold import held, recording_mesh
+from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, recording_mesh
 from gpebo_cli.recordings.table import Samples, Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
@@ -26,7 +26,7 @@ class Recording:
     """Signals of a recording: inputs and outputs share a mesh, states are the truth if known."""
 
     table: Table
-    hold: str
+    hold: Hold
     span: tuple[float, float]  # start and end of the experiment
     inputs: Trajectory  # (m,)
     outputs: Trajectory  # (r,)
@@ -36,14 +36,17 @@ class Recording:
     @property
     def derivatives(self) -> InputDerivatives | None:
         """Derivatives of the inputs: only a cubic interpolant has any."""
-        return InputDerivatives.of_signal(self.inputs) if self.hold == "cubic" else None
+        m = self.inputs.values.shape[2]
+        known = np.array([word == "cubic" for word in each_of(self.hold, m)[:m]], dtype=bool)
+        return InputDerivatives.of_signal(self.inputs, known) if known.any() else None
 
     @property
     def rows(self) -> Rows:
         """Those of the span with an output, whose ends count as rows."""
         t, (start, stop) = self.table.samples.t[self.table.measured], self.span
         inner = t[(t > start) & (t < stop)]
-        return Rows(np.concatenate([[start], inner, [stop]]), self.hold)
+        hold = of_outputs(self.hold, self.inputs.values.shape[2])
+        return Rows(np.concatenate([[start], inner, [stop]]), hold)
 
     def sampled(self, t: Array) -> Samples:
         """All signals at the times t (N,) of the span.
@@ -51,10 +54,9 @@ class Recording:
         A held input has at a sample the value of that sample, at the last one too; states are
         never held but interpolated, since they are what estimates are compared with.
         """
-        samples = self.table.samples
-        inputs = held(samples.t, samples.inputs, self.hold)(t, t)
-        outputs = held(samples.t, samples.outputs, self.hold)(t, t)
-        return Samples(t, inputs, outputs, self.states(t))
+        samples, m = self.table.samples, self.inputs.values.shape[2]
+        both = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)(t, t)
+        return Samples(t, both[:, :m], both[:, m:], self.states(t))
 
 
 def load(
@@ -73,10 +75,10 @@ def load(
     span = _span(table, time)
     samples = table.samples
     check_sizes(system, np.array(span))
-    m = system.m
+    m, hold = system.m, holds(data.hold, system)
     values = np.concatenate([samples.inputs, samples.outputs], axis=1)
-    mesh = recording_mesh(samples.t, values, data.hold, span, system.coefficients, tol)
-    both = mesh.along(held(samples.t, values, data.hold))
+    mesh = recording_mesh(samples.t, values, hold, span, system.coefficients, tol)
+    both = mesh.along(held(samples.t, values, hold))
     # What is narrow between samples: functions of time, then those of signals.
     edges, bounded = system.coefficients.of_time.resolved(mesh.edges)
     if isinstance(system.coefficients, FollowsSignals):
@@ -87,12 +89,12 @@ def load(
         both = mesh.along(both)
     return Recording(
         table=table,
-        hold=data.hold,
+        hold=hold,
         span=span,
         # Copies: each call of a kernel would make one of a part of all, as long as that is.
         inputs=Trajectory(mesh, both.values[..., :m].copy()),
         outputs=Trajectory(mesh, both.values[..., m:].copy()),
-        states=_states(samples, span, smooth=data.hold == "cubic"),
+        states=_states(samples, span, smooth=of_outputs(hold, m) == "cubic"),
         bounded=bounded,
     )
 

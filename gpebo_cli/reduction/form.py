@@ -81,9 +81,8 @@ class InputDerivatives:
         return cls(known, lambda t, inside, order: source.taylor(t, order, inside).u)
 
     @classmethod
-    def of_signal(cls, inputs: Trajectory) -> InputDerivatives:
-        """Those of the polynomials that stand for measured inputs (m,)."""
-        known = np.ones(inputs.values.shape[2], dtype=bool)
+    def of_signal(cls, inputs: Trajectory, known: BoolArray) -> InputDerivatives:
+        """Those of the polynomials that stand for the ``known`` ones of measured inputs (m,)."""
         return cls(known, lambda t, inside, k: inputs.taylor(t, k, inside), exact=False)
 
 

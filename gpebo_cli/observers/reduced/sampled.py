@@ -40,7 +40,7 @@ from gpebo_cli.observers.reduced.system import (
     measured,
     start_at,
 )
-from gpebo_cli.recordings.hold import edges, held
+from gpebo_cli.recordings.hold import Hold, each_of, edges, held, of_outputs
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
 from gpebo_cli.regression.samples import SampledRegression
@@ -70,7 +70,7 @@ class SampledState:
 class SampledObserver(Formulation):
     """A plant's observer in discrete time; immutable, see :class:`SampledState`."""
 
-    hold: str
+    hold: Hold
     errors: bool = False  # whether blocks say what errors of u and y do
 
     def responding(self, noisy: BoolArray) -> SampledObserver:
@@ -111,7 +111,8 @@ class SampledObserver(Formulation):
             ends = np.searchsorted(mesh.edges, times[1:]) - 1  # every sample is an edge
             z.append(solution.trajectory.values[ends, -1])
             if self.errors:
-                steps.append(error_steps(mesh, times, self.hold, *solution.extras))
+                lines = np.array([word == "linear" for word in each_of(self.hold, own.shape[1])])
+                steps.append(error_steps(mesh, times, lines, *solution.extras))
         step = np.concatenate(steps) if self.errors else None
         return self._block(np.concatenate(z), t, own, state, step, error)
 
@@ -184,8 +185,8 @@ class SampledObserver(Formulation):
             scale[-1], growth, smallest, error,
         )
         regression = SampledRegression(
-            t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]), self.hold,
-            scale=scale,
+            t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]),
+            of_outputs(self.hold, system.m), scale=scale,
         )
         errors = None
         if step is not None:
@@ -201,7 +202,7 @@ class SampledObserver(Formulation):
 
 
 def sampled_observer(
-    system: DescriptorSystem, solver: SolverSettings, hold: str, start: float, sample: Array,
+    system: DescriptorSystem, solver: SolverSettings, hold: Hold, start: float, sample: Array,
     derivatives: InputDerivatives | None, *,
     xi_a0: Mapping[str, float] | list[float] | None, weights: ByName | None, regression: str,
     form: str, ahead: float,
