@@ -12,19 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pages import put, table
 
 from gpebo_cli import load_plant
 from gpebo_cli.configs.files import shipped
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.results.files import write_text
 from gpebo_cli.results.style import Curve, Panel, compose, line, save
 from gpebo_cli.settings import NoiseSettings, Settings
 
 DOCS = Path(__file__).parent
 PAGE = DOCS / "howto" / "kalman.md"
-BEGIN, END = "<!-- {}: python docs/kalman.py -->\n", "<!-- end of {} -->\n"
 SEEDS = 20
 SAMPLE_TIME = 0.1
 
@@ -75,7 +74,7 @@ def errors(result: RunResult) -> tuple[Array, Array]:
     return error, np.full(error.shape, np.nan) if stated is None else stated[0][:, chosen]
 
 
-def table(rows: list[tuple[str, DescriptorSystem, float]]) -> str:
+def compared(rows: list[tuple[str, DescriptorSystem, float]]) -> str:
     """Markdown: a row per plant and level of noise, RMS errors per method."""
     head: list[str] = []
     lines = []
@@ -99,15 +98,14 @@ def table(rows: list[tuple[str, DescriptorSystem, float]]) -> str:
         head = ["plant", "σ of y", *(m.label.partition(", process")[0] for m in methods(process))]
         head[-1] += ", driven"
     head += ["stated σ of kalman_bucy", "uniformly observable"]
-    rule = ["---"] + ["---:"] * (len(head) - 2) + ["---"]
-    return "".join("| " + " | ".join(cells) + " |\n" for cells in [head, rule, *lines])
+    return table(head, lines, ["---"] + ["---:"] * (len(head) - 2) + ["---"])
 
 
 def over_time() -> str:
     """Markdown: what the table's last quarter hides, errors of e1 and stated deviations."""
     level, spans = 0.05, ((2.0, 5.0), (15.0, 20.0))
     head = ["plant", "", *(f"{a:g} to {b:g} s" for a, b in spans)]
-    lines = [head, ["---", "---", "---:", "---:"]]
+    lines = []
     circuit = load_plant("circuit")
     for method in (methods(1e-4)[0], methods(1e-4)[2]):
         results = [run(circuit, method, level, seed) for seed in range(SEEDS)]
@@ -121,7 +119,7 @@ def over_time() -> str:
     for name, column in zip(window.states, stated.T, strict=True):
         lines.append(["window", f"stated σ of {name}, {methods(1e-3)[3].label}"])
         lines[-1] += [f"{_rms(column[(t >= a) & (t <= b)]):.2g}" for a, b in spans]
-    return "".join("| " + " | ".join(cells) + " |\n" for cells in lines)
+    return table(head, lines, ["---", "---", "---:", "---:"])
 
 
 def _rms(values: Array) -> float:
@@ -147,22 +145,16 @@ def picture(path: Path) -> None:
 
 
 def main() -> None:
-    """Write the picture, and the table into the page."""
+    """Write the picture, and the tables into the page."""
     picture(DOCS / "img" / "kalman.png")
     growing = load_plant({**shipped("plant/window"), "A": [[0, 1], [-1, 0.3]]})
-    compared = table([
+    put(PAGE, "table", compared([
         ("circuit", load_plant("circuit"), 1e-4),
         ("descriptor", load_plant("descriptor"), 1e-4),
         ("window", load_plant("window"), 1e-3),
         ("window, growing", growing, 1e-3),
-    ])
-    page = PAGE.read_text(encoding="utf-8")
-    for name, text in (("table", compared), ("over time", over_time())):
-        begin, end = BEGIN.format(name), END.format(name)
-        before, _, rest = page.partition(begin)
-        _, _, after = rest.partition(end)
-        page = before + begin + text + end + after
-    write_text(PAGE, page)
+    ]))
+    put(PAGE, "over time", over_time())
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from pages import put, table
 
 from gpebo_cli import load_plant
 from gpebo_cli.configs.files import shipped
@@ -14,15 +15,13 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.results.figures import describe
-from gpebo_cli.results.files import make_folder, write_text
+from gpebo_cli.results.files import make_folder
 from gpebo_cli.results.style import Axis, Curve, Panel, compose, line, save
 from gpebo_cli.settings import NoiseSettings, Settings, TimeSettings
 
 HERE = Path(__file__).parent
 PAGE = HERE / "howto" / "noise.md"
 IMAGES = HERE / "img"
-BEGIN, END = "<!-- table: begin, by docs/noise.py -->\n", "<!-- table: end -->\n"
-BEGIN_2, END_2 = (mark.replace("table", "matrices") for mark in (BEGIN, END))
 
 LEVELS = (1e-4, 1e-3, 1e-2, 1e-1)
 SEEDS, SAMPLE_TIME = 200, 0.02
@@ -93,22 +92,22 @@ def errors() -> dict[str, dict[str, Array]]:
     return found
 
 
-def table(found: Mapping[str, Mapping[str, Array]]) -> str:
-    """The table of the page, in Markdown."""
-    lines = []
+def levels_table(found: Mapping[str, Mapping[str, Array]]) -> str:
+    """The table of every plant, in Markdown."""
+    text = "\n"
     for name, rows in found.items():
         what = "e₀ (3 parameters)" if name == "circuit" else "θ (2 parameters)"
-        heads = ["0", *(f"{level:g}" for level in LEVELS)]
-        lines += [
-            f"`plant={name}`: error of {what} at 20 s, by standard deviation σ of the output", "",
-            "| estimator | " + " | ".join(heads) + " |", "|---" * (1 + len(heads)) + "|",
-        ]
+        lines = []
         for label, values in rows.items():
             gains = ", ".join(f"γ = {g:g}" for g in ESTIMATORS[name][label].values())
             title = f"{label}, {gains}" if gains else label
-            lines.append(f"| {title} | " + " | ".join(f"{v:.1e}" for v in values) + " |")
-        lines.append("")
-    return "\n".join(lines)
+            lines.append([title, *(f"{v:.1e}" for v in values)])
+        head = ["estimator", "0", *(f"{level:g}" for level in LEVELS)]
+        text += (
+            f"`plant={name}`: error of {what} at 20 s, by standard deviation σ of the output\n\n"
+            f"{table(head, lines)}\n"
+        )
+    return text
 
 
 def level_figure(found: Mapping[str, Mapping[str, Array]], path: Path) -> None:
@@ -155,10 +154,9 @@ def step_figure(path: Path) -> None:
 
 def matrices_table() -> str:
     """Bias and deviation of least squares along measured signals and along a noise-free copy."""
-    lines = [
-        "| unknown | σ | σ over the signal | bias | deviation | bias, `noise_free` | deviation |",
-        "|---" * 7 + "|",
-    ]
+    head = ["unknown", "σ", "σ over the signal"]
+    head += ["bias", "deviation", "bias, `noise_free`", "deviation"]
+    lines = []
     for unknown, name, horizon, sample_time, levels in MATRICES:
         system = plant(name)
         j = system.unknowns.index(unknown)
@@ -175,17 +173,10 @@ def matrices_table() -> str:
                     raise RuntimeError("there is no noise")
                 cells += [result.noise.bias[0, j], result.noise.deviation[0, j]]
             share = level / np.sqrt((result.simulation.outputs**2).mean())
-            numbers = " | ".join(f"{cell:.2g}" for cell in cells)
             title = f"`{unknown}` = {system.theta[j]:g} of `{name}`"
-            lines.append(f"| {title} | {level:g} | {100 * share:.1f} % | {numbers} |")
-    return "\n".join([*lines, ""])
-
-
-def fill(begin: str, end: str, text: str) -> None:
-    """Put a table between its marks on the page."""
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(begin)
-    _, _, after = rest.partition(end)
-    write_text(PAGE, before + begin + "\n" + text + "\n" + end + after)
+            numbers = (f"{cell:.2g}" for cell in cells)
+            lines.append([title, f"{level:g}", f"{100 * share:.1f} %", *numbers])
+    return table(head, lines)
 
 
 if __name__ == "__main__":
@@ -193,5 +184,5 @@ if __name__ == "__main__":
     step_figure(IMAGES / "theta_step.png")
     results = errors()
     level_figure(results, IMAGES / "noise_levels.png")
-    fill(BEGIN, END, table(results))
-    fill(BEGIN_2, END_2, matrices_table())
+    put(PAGE, "table", levels_table(results))
+    put(PAGE, "matrices", f"\n{matrices_table()}\n")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from pages import put, table
 
 from gpebo_cli import estimators, load_plant
 from gpebo_cli.experiment import sources
@@ -23,11 +24,9 @@ from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, build
 from gpebo_cli.regression.errors import respond
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.results.files import write_text
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 
 PAGE = Path(__file__).parent / "howto" / "uncertainty.md"
-BEGIN, END = "<!-- table: begin, by docs/uncertainty.py -->\n", "<!-- table: end -->\n"
 
 SEEDS, BATCH = 2000, 100
 LEVEL, SAMPLE_TIME = 0.05, 0.1
@@ -103,12 +102,10 @@ def errors_over_seeds(
         yield Errors(names, np.concatenate(own, axis=2), predicted)
 
 
-def table() -> str:
+def coverage() -> str:
     """Coverage of ±1.96 σ and the ratio of deviations, over all times, parameters and states."""
-    lines = [
-        f"| plant | estimator | 95 % intervals cover | predicted over found, {SEEDS} seeds |",
-        "|---|---|---|---|",
-    ]
+    head = ["plant", "estimator", "95 % intervals cover", f"predicted over found, {SEEDS} seeds"]
+    lines = []
     for name in PLANTS:
         for settings, found in zip(
             ESTIMATORS, errors_over_seeds(load_plant(name), ESTIMATORS), strict=True
@@ -119,20 +116,10 @@ def table() -> str:
             ratio = (found.predicted / found.errors.std(axis=2, ddof=1))[known]
             own = ", ".join(f"{k}={v:g}" for k, v in settings.items() if not isinstance(v, str))
             label = f"{settings['name']}" + (f" ({own})" if own else "")
-            lines.append(
-                f"| {name} | {label} | {share.min():.1f} … {share.max():.1f} % "
-                f"| {ratio.min():.3f} … {ratio.max():.3f} |"
-            )
-    return "\n".join(lines) + "\n"
-
-
-def main() -> None:
-    """Write the table into the page."""
-    text = PAGE.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    write_text(PAGE, before + BEGIN + table() + END + after)
+            covered = f"{share.min():.1f} … {share.max():.1f} %"
+            lines.append([name, label, covered, f"{ratio.min():.3f} … {ratio.max():.3f}"])
+    return table(head, lines)
 
 
 if __name__ == "__main__":
-    main()
+    put(PAGE, "table", coverage())

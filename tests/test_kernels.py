@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kernel_paths import needs_kernels
 
 from gpebo_cli import kernels
 from gpebo_cli.numerics.elimination import steps_of
@@ -22,10 +23,6 @@ from gpebo_cli.reduction.form import Equations
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.reduction.strangeness_free import forcing
 
-needs_kernels = pytest.mark.skipif(
-    kernels.kind() == "numpy" and os.environ.get("GPEBO_KERNELS") != "compiled",
-    reason="the kernels are not compiled",
-)
 EPS = float(np.finfo(float).eps)
 Case = Callable[[np.random.Generator], tuple[Any, ...]]
 
