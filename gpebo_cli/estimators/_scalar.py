@@ -94,6 +94,7 @@ class ScalarPath:
 
     mesh: Mesh
     signals: MixedSignals
+    mixed: Array  # (K, s + 1) Δ
     digits: Array  # (K, s + 1) σ_min/σ_max of Ω, or less by a factor of up to p
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
     energy: Array  # (K, s + 1) I, with the pace
@@ -344,7 +345,7 @@ def scalar_path(
     energy = np.maximum.accumulate(Trajectory(mesh, weight).integral().values.ravel())
     energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    return ScalarPath(mesh, signals, digits, quotient, energy, t, at_t, floor, pace)
+    return ScalarPath(mesh, signals, delta, digits, quotient, energy, t, at_t, floor, pace)
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from gpebo_cli.estimators._recursive import Steps
 from gpebo_cli.estimators._scalar import SINGULAR, ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.mesh import Trajectory, legendre_tail
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
@@ -95,9 +94,8 @@ class PowerEstimates(MixedEstimates):
     def energies(self) -> list[float]:
         """∫|Δ|^{1+α}, with what was known before."""
         (path,), (before,) = self.groups, self.before
-        delta = np.abs(path.signals(path.mesh.points.ravel(), path.mesh.inside.ravel())[0])
-        powers = delta.reshape(path.mesh.points.shape) ** (1.0 + self.alpha)
-        return [before + float(Trajectory(path.mesh, powers).integral().final)]
+        powers = Trajectory(path.mesh, np.abs(path.mixed) ** (1.0 + self.alpha))
+        return [before + float(powers.integral().final)]
 
     @property
     def requirement(self) -> Requirement:
@@ -110,72 +108,98 @@ class PowerEstimates(MixedEstimates):
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) at the path's times, from ``start`` (P,) or (g, P), for gains (g, P or 1).
 
-        Every gain and parameter has steps of its own, because errors reach zero at different times
-        (SolverError: steps become too short).
+        Elements are steps, one after the other; whether they resolve the law is looked at for many
+        at once. In one that does not every gain and parameter has steps of its own, because errors
+        reach zero at different times (SolverError: steps become too short).
         """
-        P = path.quotient.shape[-1]
+        mesh, P = path.mesh, path.quotient.shape[-1]
         shape = (len(gains), P)
         eta, gamma = (np.broadcast_to(x, shape).ravel().copy() for x in (start, gains))
         column = np.tile(np.arange(P), len(gains))
         out = np.empty((len(eta), len(path.t)))
-        out[:, : np.searchsorted(path.t, path.mesh.edges[0], side="right")] = eta[:, None]
-        step = np.ones(len(eta))  # of the element, as it turned out to be good
-        edges = path.mesh.edges
-        for k, (left, right) in enumerate(pairwise(edges.tolist())):
-            if k % _STRETCH == 0:  # of whole elements, many at once
-                ahead = edges[k : k + _STRETCH + 1]
-                whole = _signals(path, ahead[:-1], ahead[1:])
-            at = np.zeros(len(eta))  # share of the element that is done
-            wanted = np.flatnonzero((path.t > left) & (path.t <= right))
-            places = (path.t[wanted] - left) / (right - left)
-            while (lanes := np.flatnonzero(at < 1.0)).size:
-                end = at[lanes] + step[lanes]
-                end = np.where(end > 1.0 - 1e-9, 1.0, end)
-                if (end - at[lanes] == 1.0).all():
-                    signals, of = whole, np.full(len(lanes), k % _STRETCH)
-                else:
-                    shares = left + (right - left) * np.stack([at[lanes], end])
-                    pairs, of = np.unique(shares, axis=1, return_inverse=True)
-                    signals = _signals(path, *pairs)
-                delta, Y, digits = (x[of] for x in signals)
-                Y = Y[np.arange(len(lanes)), :, column[lanes]]
-                h = (right - left) * (end - at[lanes])
-                values, good = self._step(path, h, eta[lanes], gamma[lanes], delta, Y, digits)
-                step[lanes] *= np.where(good, np.where(step[lanes] < 1.0, 2.0, 1.0), 0.25)
-                if step.min() < _SHORTEST:
-                    raise SolverError(f"the power law is not resolved near t = {left:.6g}")
-                if len(wanted):
-                    lane, j = np.nonzero(
-                        good[:, None] & (places > at[lanes, None]) & (places <= end[:, None])
-                    )
-                    share = (places[j] - at[lanes][lane]) / (end - at[lanes])[lane]
-                    weights = path.mesh.rule.interpolation(share)
-                    out[lanes[lane], wanted[j]] = np.einsum("ni,ni->n", weights, values[lane])
-                eta[lanes] = np.where(good, values[:, -1], eta[lanes])
-                at[lanes] = np.where(good, end, at[lanes])
+        stops = np.searchsorted(path.t, mesh.edges, side="right")
+        out[:, : stops[0]] = eta[:, None]
+        first, count = 0, 1
+        while first < mesh.size:
+            part = slice(first, min(first + count, mesh.size))
+            values, good = self._whole(path, part, eta, gamma, column)
+            done = len(good) if good.all() else int(np.argmin(good))
+            at = np.arange(done).repeat(np.diff(stops[first : first + done + 1]))
+            some = slice(stops[first], stops[first + done])
+            share = (path.t[some] - mesh.edges[first + at]) / mesh.steps[first + at]
+            weights = mesh.rule.interpolation(share)
+            out[:, some] = np.einsum("mi,mni->nm", weights, values[at])
+            eta = values[done - 1, :, -1] if done else eta
+            first, count = first + done, min(2 * count, _STRETCH)
+            if done < len(good):
+                some = slice(stops[first], stops[first + 1])
+                eta = self._in_parts(path, first, eta, gamma, column, path.t[some], out[:, some])
+                first, count = first + 1, 1
         return np.moveaxis(out.reshape(*shape, -1), 1, 2)
+
+    def _whole(
+        self, path: ScalarPath, part: slice, eta: Array, gamma: Array, column: IntArray
+    ) -> tuple[Array, BoolArray]:
+        """η̂ (K, n, s + 1) of n laws over some elements, and which of these are resolved (K,)."""
+        delta, h = path.mixed[part, None, 1:], path.mesh.steps[part, None]
+        digits = path.digits[part, None, 1:]
+        goal = np.moveaxis(path.quotient[part, 1:, column], -1, 1)
+        values, change = np.empty((*goal.shape[:2], goal.shape[2] + 1)), np.empty(goal.shape[:2])
+        for k, Y in enumerate(delta * goal):
+            values[k], change[k] = self._step(path, h[k], eta, gamma, delta[k], Y, digits[k])
+            eta = values[k, :, -1]
+        good = _resolved(path, values, change, delta, digits)
+        return values, np.asarray(good.all(axis=1))
+
+    def _in_parts(
+        self, path: ScalarPath, k: int, eta: Array, gamma: Array, column: IntArray, t: Array,
+        out: Array,
+    ) -> Array:
+        """η̂ (n,) of n laws at the end of an element, from its start; at the times t in ``out``."""
+        left, length = path.mesh.edges[k], path.mesh.steps[k]
+        places, eta = (t - left) / length, eta.copy()
+        at, step = np.zeros(len(eta)), np.full(len(eta), 0.25)  # shares of the element
+        while (lanes := np.flatnonzero(at < 1.0)).size:
+            begin = at[lanes]
+            end = begin + step[lanes]
+            end = np.where(end > 1.0 - 1e-9, 1.0, end)
+            pairs, of = np.unique(left + length * np.stack([begin, end]), axis=1,
+                                  return_inverse=True)
+            delta, Y, digits = (x[of] for x in _signals(path, *pairs))
+            Y = Y[np.arange(len(lanes)), :, column[lanes]]
+            h = length * (end - begin)
+            values, change = self._step(path, h, eta[lanes], gamma[lanes], delta, Y, digits)
+            good = _resolved(path, values, change, delta, digits)
+            step[lanes] *= np.where(good, 2.0, 0.25)
+            if step.min() < _SHORTEST:
+                raise SolverError(f"the power law is not resolved near t = {left:.6g}")
+            within = (places > begin[:, None]) & (places <= end[:, None])
+            lane, j = np.nonzero(good[:, None] & within)
+            weights = path.mesh.rule.interpolation((places[j] - begin[lane]) / (end - begin)[lane])
+            out[lanes[lane], j] = np.einsum("ni,ni->n", weights, values[lane])
+            eta[lanes] = np.where(good, values[:, -1], eta[lanes])
+            at[lanes] = np.where(good, end, begin)
+        return eta
 
     def _step(
         self, path: ScalarPath, h: Array, eta: Array, gamma: Array, delta: Array, Y: Array,
         digits: Array,
-    ) -> tuple[Array, BoolArray]:
-        """η̂ (n, s + 1) of n laws over steps h (n,) along signals (n, s), and which are resolved.
+    ) -> tuple[Array, Array]:
+        """η̂ (n, s + 1) of n laws over steps h (n,) along signals (n, s), and its last change (n,).
 
         Unknown are w = ⌈r⌋^α at the nodes: ⌈w_i⌋^{1/α} = 𝐘_i − Δ_i η̂_i is smooth in them where a
-        power of r is not, and η̂ follows by integration.
+        power of r is not, and η̂ follows by integration. Steps and Δ may be the same for all laws.
         """
-        rule = path.mesh.rule
         # Where 𝐘/Δ is rounding nothing is known, and the estimate does not move.
-        known = (digits > SINGULAR) & (delta != 0.0)
-        rest = np.where(known, Y - delta * eta[:, None], 0.0)
-        integral = h[:, None, None] * rule.integration * delta[:, None]
-        coupling, diagonal = delta[:, :, None] * integral, np.arange(rule.stages)
+        rest = np.where(_known(delta, digits), Y - delta * eta[:, None], 0.0)
+        integral = h[:, None, None] * path.mesh.rule.integration * delta[:, None]
+        coupling, gamma = delta[:, :, None] * integral, gamma[:, None]
         w, before = np.sign(rest) * np.abs(rest) ** self.alpha, np.full_like(rest, np.inf)
         ratio, root = self.beta / self.alpha, 1.0 / self.alpha
-        scale = np.maximum(np.abs(eta), max(np.abs(path.quotient[-1]).max(), path.floor, 1e-300))
+        scale, still = _scale(path, eta), np.where(delta, 0.0, 1.0)
         for _ in range(_ITERATIONS):
             size = np.abs(w)
-            speed, slope = gamma[:, None] * w, gamma[:, None]
+            speed, slope = gamma * w, gamma
             if self.gamma2:
                 speed = speed + self.gamma2 * np.sign(w) * size**ratio
                 slope = slope + self.gamma2 * ratio * size ** (ratio - 1.0)
@@ -184,16 +208,35 @@ class PowerEstimates(MixedEstimates):
             if (change < 1e-3 * _TOLERANCE).all():
                 break
             J = coupling * slope[:, None]
-            J[:, diagonal, diagonal] += np.where(delta, root * size ** (root - 1.0), 1.0)
+            diagonal = np.einsum("nii->ni", J)  # a view
+            diagonal += np.maximum(root * size ** (root - 1.0), still)
             # Where nothing is left of Δ and r nothing moves.
-            J[:, diagonal, diagonal] += np.where(np.abs(J).max(axis=2) > _NOTHING, 0.0, 1.0)
-            F = np.sign(w) * size**root + delta * moved - rest
+            diagonal += np.abs(J).max(axis=2) <= _NOTHING
+            F = np.copysign(size**root, w) + delta * moved - rest
             w, before = w - np.linalg.solve(J, F[..., None])[..., 0], moved
-        values = np.concatenate([eta[:, None], eta[:, None] + moved], axis=1)
-        tail = legendre_tail(values[..., None], rule, scale[:, None])[:, 0] / scale
-        worst = np.where(known, digits, 1.0).min(axis=1)
-        allowed = np.maximum(_TOLERANCE, 30.0 * _ROUNDING / worst)
-        return values, (tail < allowed) & (change < allowed)
+        return np.concatenate([eta[:, None], eta[:, None] + moved], axis=1), change
+
+
+def _known(delta: Array, digits: Array) -> BoolArray:
+    """Where 𝐘/Δ is more than rounding."""
+    return np.asarray((digits > SINGULAR) & (delta != 0.0))
+
+
+def _scale(path: ScalarPath, eta: Array) -> Array:
+    """What errors of η̂ (…) are compared with."""
+    return np.maximum(np.abs(eta), max(np.abs(path.quotient[-1]).max(), path.floor, 1e-300))
+
+
+def _resolved(
+    path: ScalarPath, values: Array, change: Array, delta: Array, digits: Array
+) -> BoolArray:
+    """Which steps (…) with η̂ (…, s + 1) are resolved, by their tail and the last change (…)."""
+    scale, rule = _scale(path, values[..., 0]), path.mesh.rule
+    flat = values.reshape(-1, values.shape[-1], 1)
+    tail = legendre_tail(flat, rule, scale.reshape(-1, 1)).reshape(scale.shape) / scale
+    worst = np.where(_known(delta, digits), digits, 1.0).min(axis=-1)
+    allowed = np.maximum(_TOLERANCE, 30.0 * _ROUNDING / worst)
+    return np.asarray((tail < allowed) & (change < allowed))
 
 
 def _signals(path: ScalarPath, left: Array, right: Array) -> tuple[Array, Array, Array]:
