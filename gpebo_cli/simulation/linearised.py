@@ -18,11 +18,11 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
 from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
 from gpebo_cli.model.text import FollowsSignals, switching
 from gpebo_cli.numerics.linalg import taylor_product
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Trajectory, signal_scale
 from gpebo_cli.reduction.strangeness_free import forcing
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
@@ -30,6 +30,10 @@ from gpebo_cli.reduction.strangeness_free import forcing
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
 _SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
+_SHORT = 1e-4  # of the longer element beside it: derivatives on a shorter one are rounding
+# Of the states, and of the longer element beside it: a shorter one may have ended at a jump of an
+# iterate before the last one, which moves the next one by the square of that.
+_FITS, _SHORTER = 1e-10, 0.25
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 
 
@@ -100,9 +104,17 @@ class Linearised:
         found, bounded = self.system.coefficients.of_time.resolved(edges)
         if not bounded or len(self.guess.mesh.edges) == 2:
             return found, bounded
-        # Where the iterate before passed a jump that this one passes a little later is no edge.
-        own, steps = self.guess.mesh.edges, self.guess.mesh.steps
-        return with_others(found, own[1:-1], _SAME * np.maximum(steps[1:], steps[:-1])), bounded
+        # Where an iterate before passed a jump that this one passes a little later is no edge, and
+        # where an even earlier one did, the polynomial of the longer element goes on.
+        mesh, k = self.guess.mesh, np.arange(self.guess.mesh.size - 1)
+        steps, scale = mesh.steps, signal_scale(self.guess.values)
+        long = np.where(steps[:-1] > steps[1:], k, k + 1)
+        short = 2 * k + 1 - long
+        t, of_long = mesh.points[short], mesh.edges[long] + 0.5 * steps[long]
+        goes_on = self.guess(t.ravel(), of_long.repeat(t.shape[1])).reshape(*t.shape, -1)
+        apart = np.abs(goes_on - self.guess.values[short]).max(axis=1)
+        edge = (apart > _FITS * scale).any(axis=1) | (steps[short] > _SHORTER * steps[long])
+        return with_others(found, mesh.edges[1:-1][edge], _SAME * steps[long[edge]]), bounded
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -170,9 +182,30 @@ class Linearised:
             known = known._replace(theta=np.zeros((order + 1, len(t), self.system.q)))
             known.theta[0] = self.theta
         x = self.guess.taylor(t, order, inside)
+        if order:
+            # Derivatives within a very short element are rounding. Those beside it do as well: an
+            # error of the guess's derivatives is of second order where its values are right.
+            mesh = self.guess.mesh
+            k, beside = mesh.sampler(t, inside).element, _beside(mesh.steps)
+            some = np.flatnonzero(beside[k] != k)
+            if len(some):
+                other = beside[k[some]]
+                x[1:, some] = self.guess.taylor(
+                    mesh.edges[np.maximum(other, k[some])], order,
+                    mesh.edges[other] + 0.5 * mesh.steps[other],
+                )[1:]
         y = taylor_product(known.C, x) + taylor_product(known.D, known.u)
         y += taylor_product(known.H, known.theta)
         return known, x, np.concatenate([known.u, y], axis=2)
+
+
+def _beside(steps: Array) -> IntArray:
+    """For each element, of lengths (K,), the one whose derivatives tell its own: mostly itself."""
+    found = np.arange(len(steps))
+    after, before = (steps[:-1] < _SHORT * steps[1:]), (steps[1:] < _SHORT * steps[:-1])
+    found[:-1] += after
+    found[1:] -= before & (found[1:] == np.arange(1, len(steps)))
+    return found
 
 
 def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bool]:
