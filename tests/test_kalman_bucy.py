@@ -288,6 +288,17 @@ def test_nothing_to_filter_is_one_line(entries):
     assert api_run(plant, observer="gpebo", time={"horizon": 1}).details.metrics is not None
 
 
+@pytest.mark.parametrize(("phi", "level", "said"), [
+    ("cos(y)", 0.1, True), ("cos(y)", 0.0, False), ("cos(t)", 0.1, False),
+])
+def test_noise_in_the_matrices_is_not_in_the_deviations_and_that_is_said(phi, level, said):
+    noise = {"name": "gaussian", "outputs": level} if level else "none"
+    result = api_run(one_state(phi=[phi]), observer="kalman_bucy", noise=noise,
+                     time={"horizon": 1.0, "samples": 11})
+    told = "deviations know nothing of the noise of y in the matrices"
+    assert (told in result.verdict) == said
+
+
 def test_the_table_does_not_ask_since_when_a_moving_parameter_is_known():
     """The filter's w_<state> is a state: it stands at no value, and its state has the evidence."""
     made = api_run("descriptor", observer="none", time={"horizon": 5.0, "samples": 101})

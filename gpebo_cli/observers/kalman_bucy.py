@@ -244,8 +244,7 @@ class KalmanBucy:
         mesh, q, split = known.mesh, system.q, known.first.split
         windows = [mesh] if few or signals.asked is None else mesh.windows()
         noise, level = _noise(signals, system, evidence)
-        note = known.note
-        note += f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
+        note = known.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
         unknown = noise.rows is not None and not noise.variances.any()
 
         steps = _steps(noise, mesh)
@@ -349,6 +348,13 @@ class KalmanBucy:
 
 
 OBSERVER = KalmanBucy
+
+
+def _told(level: float, inside: Sequence[str]) -> str:
+    """A ``level`` of noise from the residual, and whose noise is ``inside`` matrices, with "; "."""
+    told = f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
+    told += "; deviations know nothing of the noise of " * bool(inside) + ", ".join(inside)
+    return told + " in the matrices" * bool(inside)
 
 
 def _noise(

@@ -134,11 +134,12 @@ class EquationForm:
             return ()
         return tuple(sorted({j for _, j in self.derivatives}))
 
-    def noise_enters(self, noisy: BoolArray) -> bool:
-        """Whether noise of the ``noisy`` ones of [u; y] (m + r,) is in matrices or in slopes."""
+    def noise_enters(self, noisy: BoolArray) -> tuple[str, ...]:
+        """Which of the ``noisy`` ones of [u; y] (m + r,) have their noise in matrices or slopes."""
         system, slopes = self.system, (self.system.inputs[j] for j in self.interpolated)
         names = frozenset(slopes).union(*system.coefficients.signals.values())
-        return not names.isdisjoint(compress((*system.inputs, *system.outputs), noisy))
+        both = compress((*system.inputs, *system.outputs), noisy)
+        return tuple(name for name in both if name in names)
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
         """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
