@@ -515,6 +515,18 @@ def test_instants_of_iterates_before_leave_no_edges():
     np.testing.assert_allclose(found.signals.states(t), truth, rtol=0, atol=1e-13)
 
 
+def test_derivatives_of_what_follows_outputs_have_all_digits():
+    """Differences left 1e-10, which hid the rank of rows that cancel: index 3 was refused."""
+    system = plant_from_mapping({
+        "name": "cube", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [["y**3"]], "C": [[1]],
+        "initial_state": [0.0],
+    })
+    mesh = Mesh(np.array([0.0, 2.0]), radau_rule(9))
+    t = np.array([0.7, 1.0, 1.6])
+    A = Linearised(system, Trajectory(mesh, mesh.points[..., None] ** 2)).taylor(t, 2).A[:, :, 0, 0]
+    np.testing.assert_allclose(A, [4 * t**6, 24 * t**5, 60 * t**4], rtol=1e-12)
+
+
 def test_derivatives_along_very_short_elements_are_no_rounding():
     """Between instants 1e-9 s apart, a second derivative of values would be wrong by 100."""
     system = plant_from_mapping({

@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
 from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
 from gpebo_cli.model.text import FollowsSignals, switching
@@ -26,7 +27,8 @@ from gpebo_cli.numerics.mesh import Trajectory, signal_scale
 from gpebo_cli.reduction.strangeness_free import forcing
 
 # Share of an output by which it is moved to see what depends on it: G is wrong by the square of it
-# and by rounding over it, which costs Newton's method nothing that could be seen.
+# and by rounding over it. Without derivatives that costs Newton's method nothing that could be
+# seen.
 _SHIFT = 6e-6
 _NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
 _SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
@@ -34,6 +36,7 @@ _SHORT = 1e-4  # of the longer element beside it: derivatives on a shorter one a
 # Of the states, and of the longer element beside it: a shorter one may have ended at a jump of an
 # iterate before the last one, which moves the next one by the square of that.
 _FITS, _SHORTER = 1e-10, 0.25
+_LARGE = 1e60  # beside it, coefficients of a right side itself are nothing
 _NO_MORE = 1e-15  # of a right side: what an output moves it by is rounding up to that
 
 
@@ -123,6 +126,44 @@ class Linearised:
         source = self.system.coefficients
         known, x, along = self._along(t, order, inside, signals)
         c = source.taylor(t, order, inside, along)
+        G = self._slopes(t, inside, known, x, along) if order else None
+        G = self._differences(t, inside, known, x, along) if G is None else G
+        GC, GH = taylor_product(G, c.C), taylor_product(G, c.H)
+        phi = c.phi - taylor_product(GC, x) - taylor_product(GH, known.theta)
+        return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
+
+    def _slopes(
+        self, t: Array, inside: Array | None, known: Coefficients, x: Array, along: Array
+    ) -> Array | None:
+        """G (order + 1, N, n, r), if more derivatives than asked for are known: else None.
+
+        With y_j(τ) + c τ^(k+1), the Taylor coefficients k + 1 to 2k + 1 of a right side are
+        those of its derivative to order k, times c: no difference is taken. Rounding of these
+        hides the rank of rows that cancel.
+        """
+        source, orders = self.system.coefficients, len(x)
+        if not isinstance(source, FollowsSignals):
+            return None
+        G = np.empty((*x.shape, self.system.r))
+        x, u, theta, along = (
+            np.concatenate([v, np.zeros_like(v)]) for v in (x, known.u, known.theta, along)
+        )
+        for j in range(self.system.r):
+            along[orders, :, self.system.m + j] = _LARGE
+            try:
+                m = source.taylor(t, 2 * orders - 1, inside, along)
+            except ConfigError:
+                return None
+            along[orders, :, self.system.m + j] = 0.0
+            f = forcing(m._replace(u=u, theta=theta)) + taylor_product(m.A, x)
+            G[..., j] = f[orders:] / _LARGE
+        return G
+
+    def _differences(
+        self, t: Array, inside: Array | None, known: Coefficients, x: Array, along: Array
+    ) -> Array:
+        """The same to rounding over a small share of y, and to the square of that."""
+        source, order = self.system.coefficients, len(x) - 1
         y = along[0, :, self.system.m :].copy()
         there = t if inside is None else aside(t, inside)
         size = np.abs(y)
@@ -148,9 +189,7 @@ class Linearised:
             apart = ends[0] - ends[1]
             apart[np.abs(apart) <= _NO_MORE * np.abs(ends[0])] = 0.0
             G[..., j] = apart / np.maximum(width, 1e-300)[:, None]
-        GC, GH = taylor_product(G, c.C), taylor_product(G, c.H)
-        phi = c.phi - taylor_product(GC, x) - taylor_product(GH, known.theta)
-        return c._replace(A=c.A + GC, F=c.F + GH, phi=phi, u=known.u)
+        return G
 
     def _sides(self, t: Array, along: Array) -> Array:
         """Side of each jump or kink (N, number) where [u; y] (order + 1, N, m + r) is; 0: on it."""
