@@ -67,7 +67,7 @@ def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     assert reproduce.main(["gelda"]) == 1
     out = capsys.readouterr().out
     assert "OFF by 0.1" in out
-    assert out.endswith("1 recipes, 1 numbers, 1 off\n")
+    assert out.endswith("1 recipe, 1 number, 1 off\n")
     assert_refused(gpebo("reproduce", "geldaa", cwd=tmp_path), "did you mean gelda?")
 
 

@@ -73,7 +73,10 @@ def main(words: list[str]) -> int:
     off = [finding for finding in findings if not finding.holds]
     count = len({finding.recipe for finding in findings})
     if off or not options.quiet:
-        sys.stdout.write(f"{count} recipes, {len(findings)} numbers, {len(off)} off\n")
+        from gpebo_cli.model.matrix import counted
+
+        numbers = counted(len(findings), "number")
+        sys.stdout.write(f"{counted(count, 'recipe')}, {numbers}, {len(off)} off\n")
     return 1 if off else 0
 
 
