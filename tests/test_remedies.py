@@ -17,6 +17,7 @@ from plants import observed as along
 from processes import assert_refused, refused
 from regressions import ETA, three
 from regressions import regression as make_regression
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from test_observer import ROTATING
 
@@ -26,10 +27,12 @@ from gpebo_cli.evidence.excitation import window_level
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
-from gpebo_cli.regression.dynamics import filtered
+from gpebo_cli.regression import dynamics
+from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 
@@ -553,3 +556,37 @@ def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):
     monkeypatch.setattr("gpebo_cli.observers._riccati._FALL", 0.0)
     with pytest.raises(SolverError, match=r"a double; give the gain, observer\.injection, or"):
         run(GROWING, 1.0, remedy="output_injection")
+
+
+@pytest.mark.parametrize("growth", [0.0, 1e3])
+@np.errstate(all="ignore")
+def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elements(
+    growth, monkeypatch
+):
+    """Ω' = −(Λ + ρI + 𝔸ᵀ)Ω − Ω𝔸 + Γψᵀψ and 𝒴 likewise, by another solver; ρ changes."""
+    monkeypatch.setattr(dynamics, "_GROWTH", growth)
+    rates, gains = np.array([0.1, 0.7]), np.array([2.0, 3.0])
+    mesh = initial_mesh(0.0, 4.0, [], 40, radau_rule(9))
+
+    def signals(t):
+        A = np.array([[0.3 * np.cos(t), 1.0 + 0.0 * t], [-1.0 - 0.0 * t, -1.0 - 0.2 * t]])
+        psi = np.array([1.0 + 0.0 * t, np.sin(3.0 * t)])
+        return A, np.array([np.sin(t), np.cos(t)]), psi[:, None] * np.array([*psi, np.cos(t)])
+
+    A, b, outer = (
+        Trajectory(mesh, np.moveaxis(x, (-2, -1), (0, 1))) for x in signals(mesh.points)
+    )
+    moves = Dynamics(A, b, np.array([1.0, 4.0]))
+    times, levels = moves.forgetting
+
+    def slope(t, X, rho):
+        (A, b, forced), X = signals(t), X.reshape(2, 3)
+        moved = np.column_stack([X[:, :2] @ A, -X[:, :2] @ b])
+        return (gains[:, None] * forced - (A.T + np.diag(rates + rho)) @ X - moved).ravel()
+
+    X = np.arange(6.0)
+    for start, stop, rho in zip([0.0, *times], [*times, 4.0], levels, strict=True):
+        solved = solve_ivp(slope, (start, stop), X, "DOP853", args=(rho,), rtol=1e-12, atol=1e-12)
+        X = solved.y[:, -1]
+    found = filtered(outer, rates, gains, moves, np.arange(6.0).reshape(2, 3)).final
+    np.testing.assert_allclose(found.ravel(), X, rtol=1e-9)

@@ -8,18 +8,21 @@ from functools import cached_property
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.kernels import elements
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import halved, with_others
-from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.collocation import merged, solve
 from gpebo_cli.numerics.linalg import largest_over_time, transpose
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
+from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, joined, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.refinement import refine
 
 TOLERANCE = 1e-12
 _MAX_ELEMENTS = 200_000
 _ADVICE = "use another observer.remedy, or a shorter time.horizon"
 _LEVELS, _BESIDE_TIES = 96, 0.1234  # of ρ, a decade; none of them is at a round number
 _SHORT = 0.01  # of a decay's own time
+_GROWTH = 1e3  # within an element: as many digits are lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +98,76 @@ def filtered(
     for window in outer.mesh.windows():
         within = times[(times > window.span[0]) & (times < window.span[1])]
         finer = Mesh(with_others(window.edges, within), window.rule)
-        pieces.append(_over(finer, outer, gains, moving, known, sizes))
+        arguments = finer, outer, gains, moving, known, sizes
+        pieces.append(_carried(*arguments) or _over(*arguments))
         known = pieces[-1].final
         sizes = np.maximum(sizes, largest_over_time(pieces[-1].values, 2))
     found = joined(pieces)
     return Trajectory(found.mesh, found.values / own)
+
+
+def _carried(
+    mesh: Mesh, outer: Trajectory, gains: Array,
+    moving: Callable[[Array, Array], tuple[Array, Array, Array]], start: Array, sizes: Array,
+) -> Trajectory | None:
+    """:func:`_over` for short elements, where nothing grows much; None: something does.
+
+    W' = (𝔸 + Λ + ρI) W and N' = [[𝔸, −𝕓], [0, 0]] N, which start at I in each element, make
+
+        (Wᵀ [Ω | 𝒴] N)' = Wᵀ Γψᵀ[ψ | y] N
+
+    an integral: systems have p equations instead of the p² of Ω.
+    """
+    p, rule = len(start), mesh.rule
+
+    def maps(mesh: Mesh, some: BoolArray) -> list[Array]:
+        """At the nodes of some elements W⁻ᵀ, the integral from the left end, N⁻¹, and sizes."""
+        h, t, inside = mesh.steps[some], mesh.points[some], mesh.inside[some]
+        decay, A, b = moving(t.ravel(), inside.ravel())
+        own, count = np.arange(len(h)), len(h)
+
+        def solved(A: Array, f: Array) -> tuple[Array, Array]:
+            return elements.element_maps(
+                rule.differentiation, h, None, A, f, None, None, own, count
+            )
+
+        W = transpose(solved(transpose(decay), np.zeros((1, p, 0)))[0])
+        N = np.zeros((count, rule.stages, p + 1, p + 1))
+        N[..., p, p] = 1.0
+        N[..., :p, :p], N[..., :p, p:] = solved(A, -b[..., None])
+        forced = gains[:, None] * outer(t[:, 1:].ravel(), inside[:, 1:].ravel())
+        added = W @ forced.reshape(count, rule.stages, p, p + 1) @ N
+        weights = h[:, None, None] * rule.integration
+        added = (weights @ added.reshape(count, rule.stages, -1)).reshape(added.shape)
+        back, forth = np.asarray(np.linalg.inv(W)), np.asarray(np.linalg.inv(N))
+        largest = [np.abs(each).max(axis=(1, 2, 3)) for each in (W, N, back, forth)]
+        return [back, added, forth, np.stack(largest, axis=1)]
+
+    def evaluate(
+        mesh: Mesh, before: tuple[list[Array], Array] | None, kept: IntArray
+    ) -> tuple[tuple[list[Array], Array], Array]:
+        parts = first if before is None else merged(before[0], maps(mesh, kept < 0), kept)
+        back, added, forth, _ = parts
+        values = np.empty((mesh.size, rule.stages + 1, p, p + 1))
+        reached = start
+        for k in range(mesh.size):
+            values[k, 0] = reached
+            reached = back[k, -1] @ (reached + added[k, -1]) @ forth[k, -1]
+        values[:, 1:] = back @ (values[:, :1] + added) @ forth
+        kinds = []
+        for part in (np.s_[..., :p], np.s_[..., p:]):
+            signal = values[part].reshape(*values.shape[:2], -1)
+            kinds.append((signal, np.maximum(sizes[part].ravel(), SHARE * np.abs(signal).max())))
+        return (parts, values), unresolved_kinds(kinds, rule)
+
+    first = maps(mesh, np.ones(mesh.size, dtype=bool))
+    if not first[3].max() < _GROWTH:
+        return None
+    mesh, (_, values), _ = refine(
+        evaluate, mesh, tol=TOLERANCE, max_elements=_MAX_ELEMENTS, name="filter of the regressor",
+        advice=_ADVICE,
+    )
+    return Trajectory(mesh, values)
 
 
 def _over(
