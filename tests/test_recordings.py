@@ -442,22 +442,24 @@ def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
         read(path, **OF_ELSEWHERE)
 
 
-@pytest.mark.parametrize(("missing", "lines", "V"), [
-    ("hold", (3, 6), [1.0, 1.0, 2.0, 2.0]), ("interpolate", (3, 5), [1.0, 1.5, 2.0]),
+@pytest.mark.parametrize(("missing", "hold", "lines", "V"), [
+    ("hold", "linear", (3, 6), [1.0, 1.0, 2.0, 2.0]),
+    ("interpolate", "linear", (3, 5), [1.0, 1.5, 2.0]),
+    ("interpolate", {"V": "zoh"}, (3, 5), [1.0, 1.0, 2.0]),
 ])
-def test_rows_before_all_signals_have_begun_are_left_out(tmp_path, missing, lines, V):
+def test_rows_before_all_signals_have_begun_are_left_out(tmp_path, missing, hold, lines, V):
     path = tmp_path / "r.csv"
     path.write_text("t,V,y\n0,,5\n1,1,6\n2,,7\n3,2,8\n4,,9\n")
-    found = read(path, missing=missing)
+    found = read(path, missing=missing, hold=hold)
     assert found.lines == lines
     assert found.samples.inputs[:, 0].tolist() == V
     assert found.samples.outputs[:, 0].tolist() == [6.0, 7.0, 8.0, 9.0][: len(V)]
     if missing == "hold":
-        rows, wrong = streamed(path, path.read_bytes(), missing=missing)
+        rows, wrong = streamed(path, path.read_bytes(), missing=missing, hold=hold)
         assert (wrong, [row[1] for row in rows]) == ("", V)
     path.write_text("t,V,y\n0,,5\n1,,6\n")
     with pytest.raises(ConfigError, match="0 rows without gaps; 2 are needed"):
-        read(path, missing=missing)
+        read(path, missing=missing, hold=hold)
 
 
 def test_rows_that_repeat_a_time_are_left_out_where_that_is_said(tmp_path):

@@ -26,6 +26,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import read_mat
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.reading import read_bytes
+from gpebo_cli.recordings.hold import each_of, holds
 from gpebo_cli.schema import LARGEST, nearest, shown
 from gpebo_cli.settings import DataSettings
 
@@ -320,8 +321,10 @@ def _year_first(found: re.Match[str]) -> str:
     return f"{year}-{month:0>2}-{day:0>2}"
 
 
-def _without_gaps(data: DataSettings, values: Array) -> BoolArray:
+def _without_gaps(data: DataSettings, values: Array, system: DescriptorSystem) -> BoolArray:
     """Fills gaps in rows (N, columns) as ``data.missing`` wants it; which rows are kept (N,).
+
+    What is interpolated is what is assumed between samples: of a signal that is held the last one.
 
     Signals begin one after the other where they are of different rates: rows before the last one
     has begun are left out, and between samples those after the first one has ended.
@@ -332,9 +335,10 @@ def _without_gaps(data: DataSettings, values: Array) -> BoolArray:
     kept = np.logical_or.accumulate(there).all(axis=1)
     if data.missing == "interpolate":
         kept &= np.logical_or.accumulate(there[::-1])[::-1].all(axis=1)
+    words = ("", *each_of(holds(data.hold, system), system.m + system.r))
     for k in np.flatnonzero(~there.all(axis=0) & there.any(axis=0)):
         known = np.flatnonzero(there[:, k])
-        if data.missing == "hold":
+        if data.missing == "hold" or words[k : k + 1] == ("zoh",):
             last = np.searchsorted(known, np.arange(len(values)), side="right") - 1
             values[:, k] = values[known[last], k]
         else:
@@ -355,7 +359,7 @@ def _table(
     first_line: int,
 ) -> Table:
     count, gaps = len(values), np.isnan(values[:, 1 : 1 + system.m + system.r])
-    kept = np.flatnonzero(_without_gaps(data, values))
+    kept = np.flatnonzero(_without_gaps(data, values, system))
     if len(kept) < 2:
         raise ConfigError(f"{header.source} has {len(kept)} rows without gaps; 2 are needed")
     if len(kept) < len(values):
