@@ -332,6 +332,28 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     assert ("taken from the residual, 0.3" in result.verdict) == (level != "given")
 
 
+@pytest.mark.parametrize(("rate", "told"), [
+    (-0.5, "explain the data up to white noise, 1.0"),
+    (-0.525, "times what the sensors' noise makes, is not white"),
+])
+def test_a_wrong_plant_does_not_explain_a_recording(rate, told):
+    """One rate is off by 5 %: the filter's estimate is 80 deviations off, which its own P hides."""
+    t, sigma, leak = np.linspace(0.0, 20.0, 2001), 0.01, 0.3
+    # h' = -h/2 + 1 + sin t - leak
+    h = 2.0 * (1.0 - leak) + (2.0 * np.sin(t) - 4.0 * np.cos(t)) / 5.0
+    y = h + sigma * np.random.default_rng(0).standard_normal(len(t))
+    plant = one_state(
+        A=[[rate]], B=[[1]], F=[[-1]], inputs={"u": 0}, unknowns={"leak": leak}, initial_state=[0]
+    )
+    noise = {"name": "gaussian", "outputs": sigma}
+    data = pd.DataFrame({"t": t, "u": 1.0 + np.sin(t), "y": y})
+    found = api_run(plant, data=data, observer="kalman_bucy", noise=noise)
+    std = found.details.estimation.parameters_std[0, -1, 0]
+    off = abs(found.estimates["leak"][0, -1] - leak) / std
+    assert (off < 3.0) == (rate == -0.5)
+    assert told in found.verdict
+
+
 @pytest.mark.parametrize("hold", ["linear", "zoh"])
 def test_the_deviation_of_a_long_recording_is_that_of_its_uneven_rows(hold):
     """Of constant levels: each is a sum of rows, and outputs of one row each tell its weights."""

@@ -123,7 +123,8 @@ def continuous(
             )
     fit = fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty and not levels.silent:
-        fit = replace(fit, ratio=residual_ratio(observation, source, settings.noise, levels))
+        about = observation.evidence or observation
+        fit = replace(fit, ratio=residual_ratio(about, source, settings.noise, levels))
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds") as pace:

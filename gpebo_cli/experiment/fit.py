@@ -24,10 +24,14 @@ def fit_of(
     observation: Observation, estimation: EstimationResult, system: DescriptorSystem,
     source: Source,
 ) -> Fit | None:
-    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ."""
-    regression = observation.regression
-    final = estimation.explaining
-    if final is None or estimation.names != regression.parameters:
+    """Root mean squares over time of Y − ψη̂ with the final estimates, and of Y; the fitted ŷ.
+
+    Of an observer that estimates by itself η̂ are least squares of its evidence.
+    """
+    about = observation.evidence or observation
+    regression = about.regression
+    final = estimation.explaining if about is observation else regression.least_squares()[None]
+    if final is None or (about is observation and estimation.names != regression.parameters):
         return None
     duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
 
@@ -38,7 +42,7 @@ def fit_of(
     if regression.resets or regression.dynamics is not None:
         return fit
     return _explained(
-        fit, final[fit.best], observation, system, source,
+        fit, final[fit.best], about, system, source,
         every=regression.factor is None and not source.pieces,
     )
 

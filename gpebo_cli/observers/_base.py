@@ -265,6 +265,8 @@ class Observation:
     growth: float | None  # largest entry of Φ since its last reset; None: states do not rest on Φ
     estimator: Estimator | None = None
     names: tuple[str, ...] | None = None
+    # Whose least squares say what the plant explains, where this observer estimates by itself.
+    evidence: Observation | None = None
     respond: Response | None = None  # None: the observer cannot tell
     errors: ErrorsAt | None = None  # the same as a linear system; its outputs are δY, δoffset
     growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon

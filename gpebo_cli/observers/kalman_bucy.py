@@ -342,6 +342,8 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
+            # A drift of the estimates is no constant that would explain all of the data.
+            evidence=None if any(process) else evidence,
             note=note
             + f"; measurement noise regularised: {share}(observer.regularisation)" * regularised,
         )
