@@ -337,7 +337,7 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     (-0.525, "times what the sensors' noise makes, is not white"),
 ])
 def test_a_wrong_plant_does_not_explain_a_recording(rate, told):
-    """One rate is off by 5 %: the filter's estimate is 80 deviations off, which its own P hides."""
+    """One rate is off by 5 %: estimates are 270 deviations off, which P does not tell."""
     t, sigma, leak = np.linspace(0.0, 20.0, 2001), 0.01, 0.3
     # h' = -h/2 + 1 + sin t - leak
     h = 2.0 * (1.0 - leak) + (2.0 * np.sin(t) - 4.0 * np.cos(t)) / 5.0
