@@ -494,9 +494,9 @@ def test_an_output_may_pass_a_jump_and_come_back_at_once(argument, inside):
     found = simulate(system, TimeSettings(horizon=10.0), SolverSettings(tol=1e-9))
     truth = 2 * sum(time_between(*each) for each in inside) - 10.0
     error = abs(found.signals.states.final[1] - truth)
-    assert error < 1e-9 + 100 * 10 * found.state_errors[1]
-    # So near to its top rounding of y by 1e-15 moves the instants by 1e-9.
-    assert found.state_errors[1] < (1e-5 if "1e-12" in argument else 1e-8)
+    assert error < 1e-9 + 5 * 10 * found.state_errors[1]
+    # At a top that is 1e-12 high, rounding decides whether all of the pass, 3e-6 s, is seen.
+    assert found.state_errors[1] < (2e-6 if "1e-12" in argument else 1e-8)
 
 
 def test_instants_of_iterates_before_leave_no_edges():
