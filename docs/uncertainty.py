@@ -30,12 +30,12 @@ PAGE = Path(__file__).parent / "howto" / "uncertainty.md"
 
 SEEDS, BATCH = 2000, 100
 LEVEL, SAMPLE_TIME = 0.05, 0.1
-PLANTS = ("circuit", "descriptor", "strangeness_free")
+PLANTS = ("circuit", "descriptor", "strangeness_free", "battery")
 ESTIMATORS: tuple[Mapping[str, object], ...] = (
     {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "ls_drem"},
     {"name": "drem", "gamma": 1e14}, {"name": "fct", "gamma": 1e14}, {"name": "gradient"},
 )
-TIMES = np.linspace(6.0, 20.0, 8)
+TIMES = np.linspace(2.0, 20.0, 10)
 
 
 class Errors(NamedTuple):

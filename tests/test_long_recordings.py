@@ -188,7 +188,7 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     edges = np.sort(np.append(samples, jump))
     rows = Rows(samples)
     groups = grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
-    mesh, fresh, _ = uncertainty._mesh(edges, groups)
+    mesh, fresh, _ = uncertainty._mesh(edges, groups, ())
     expected = np.union1d(groups.starts, [jump, 100.0])
     np.testing.assert_array_equal(mesh.edges, expected)
     assert mesh.size < 1500

@@ -12,6 +12,7 @@ from plants import one_state, shipped
 
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
+from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment.pipeline import stream
@@ -532,3 +533,18 @@ def test_a_stream_says_deviations_where_a_run_at_samples_does(name):
         ours = np.hstack([found.estimation.parameters_std[0], found.estimation.states_std[0]])
         assert np.isfinite(std[10:]).all()
         np.testing.assert_allclose(std, ours, rtol=1e-6)
+
+
+def test_deviations_behind_the_start_do_not_depend_on_the_elements(monkeypatch):
+    """There the law of ls_drem goes as a power of the time, which equal elements do not follow."""
+    def early():
+        noise = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.1}
+        found = run("circuit", estimator="ls_drem", noise=noise, time={"horizon": 20.0})
+        t = found.details.estimation.t
+        return found.details.estimation.parameters_std[0, (t > 0.1) & (t < 1.0)]
+
+    usual = early()
+    assert len(usual) > 10
+    monkeypatch.setattr(uncertainty, "_ELEMENTS", 4000)
+    monkeypatch.setattr(uncertainty, "_MOST_PARTS", 64)
+    np.testing.assert_allclose(usual, early(), rtol=0.1)
