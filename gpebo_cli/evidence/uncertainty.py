@@ -121,8 +121,9 @@ def _propagated(
         here[:, :, :size] += places[:, 0, None, None] * np.eye(size)
         reached = here @ before  # of [ζ; s] (M, size, ·)
         inside = mesh.inside[element, 1]
-        o, e = observer(t[chosen], inside), estimator(t[chosen], inside)
-        eta = e.C @ reached[:, zeta:]
+        o = observer(t[chosen], inside)
+        C = joint.C if len(joint.C) == 1 else estimator(t[chosen], inside).C  # alike at all times
+        eta = C @ reached[:, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
         now = groups.weights(t[chosen], group[element], groups.after)
         if not groups.alone:  # errors of one row and the one behind it, not of many
@@ -325,7 +326,7 @@ def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) 
 def _joint(
     observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, part: slice, n: int
 ) -> ErrorSystem:
-    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at the nodes of some elements."""
+    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at the nodes of some elements; C of s."""
     points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
     o, e = observer(points, inside), estimator(points, inside)
     zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
@@ -338,7 +339,7 @@ def _joint(
     B[:, :zeta] = o.B
     B[:, zeta:] = e.B @ o.D[:, :rows]
     shape = (-1, mesh.rule.stages, zeta + own)
-    return ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), o.C, o.D)
+    return ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
 
 
 def _factors(
