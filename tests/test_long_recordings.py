@@ -188,9 +188,10 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     edges = np.sort(np.append(samples, jump))
     rows = Rows(samples)
     groups = grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
-    mesh, fresh, _ = uncertainty._mesh(edges, groups, ())
+    mesh, fresh, _ = uncertainty._mesh(edges, groups, edges[:1])
     expected = np.union1d(groups.starts, [jump, 100.0])
-    np.testing.assert_array_equal(mesh.edges, expected)
+    late = mesh.edges > 4.0  # before, elements are shorter than groups
+    np.testing.assert_array_equal(mesh.edges[late], expected[expected > 4.0])
     assert mesh.size < 1500
     np.testing.assert_array_equal(mesh.edges[:-1][fresh], groups.starts)
 

@@ -535,16 +535,31 @@ def test_a_stream_says_deviations_where_a_run_at_samples_does(name):
         np.testing.assert_allclose(std, ours, rtol=1e-6)
 
 
-def test_deviations_behind_the_start_do_not_depend_on_the_elements(monkeypatch):
+@pytest.mark.parametrize("name", ["circuit", "strangeness_free"])
+def test_deviations_behind_the_start_do_not_depend_on_the_elements(name, monkeypatch):
     """There the law of ls_drem goes as a power of the time, which equal elements do not follow."""
     def early():
         noise = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.1}
-        found = run("circuit", estimator="ls_drem", noise=noise, time={"horizon": 20.0})
+        found = run(name, estimator="ls_drem", noise=noise, time={"horizon": 20.0})
         t = found.details.estimation.t
         return found.details.estimation.parameters_std[0, (t > 0.1) & (t < 1.0)]
 
     usual = early()
     assert len(usual) > 10
-    monkeypatch.setattr(uncertainty, "_ELEMENTS", 4000)
-    monkeypatch.setattr(uncertainty, "_MOST_PARTS", 64)
-    np.testing.assert_allclose(usual, early(), rtol=0.1)
+    for setting, finer in (("_ELEMENTS", 6000), ("_MOST_PARTS", 64), ("_SINCE", 128)):
+        monkeypatch.setattr(uncertainty, setting, finer)
+    np.testing.assert_allclose(usual, early(), rtol=0.01)
+
+
+@pytest.mark.parametrize("step", [0.1, 1e-4])
+def test_deviations_of_a_recording_that_begins_long_after_zero(step):
+    """Seconds since 1970, of which a double holds 2.4e-7: no element is as short as that."""
+    rng, t = np.random.default_rng(0), step * np.arange(200)
+    y = np.exp(-t / t[-1]) + 0.01 * rng.standard_normal(len(t))
+    plant = one_state(A=[[-1.0 / t[-1]]], initial_state={"x": 1.0})
+
+    def at(start):
+        found = run(plant, data={"t": start + t, "y": y}, estimator="ls_drem").details.estimation
+        return np.append(found.parameters_std[0, -1], found.states_std[0, -1])
+
+    np.testing.assert_allclose(at(1.7e9), at(0.0), rtol=0.01)

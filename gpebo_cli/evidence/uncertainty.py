@@ -33,7 +33,10 @@ from gpebo_cli.regression.samples import SampledRegression, integrating
 _STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
 _ELEMENTS = 400  # about so many at least
 _MOST_PARTS = 8
-_HALVINGS = 20  # of the first element behind a start, where laws may go as a power of the time
+# Behind a start laws may go as a power of the time since then.
+_SINCE = 32  # parts at least of that time
+_HALVINGS = 8  # of the first row there
+_SHORTEST = 1e-12  # of the times: where an element is shorter, its nodes are rounding
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
@@ -84,7 +87,7 @@ def _propagated(
 ) -> tuple[Array, Array]:
     """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
     n, p = gain.shape[1:]
-    mesh, fresh, group = _mesh(edges, groups, [*starts, *(time for time, _ in resets)])
+    mesh, fresh, group = _mesh(edges, groups, np.union1d(starts, [time for time, _ in resets]))
     until = np.append(groups.starts[1:], np.inf)
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
@@ -252,13 +255,11 @@ def noise_level(
     return float(np.sqrt(square / left)) if more and left > _LEFT * whole else np.nan
 
 
-def _mesh(
-    edges: Array, groups: Groups, starts: Sequence[float]
-) -> tuple[Mesh, BoolArray, IntArray]:
+def _mesh(edges: Array, groups: Groups, starts: Array) -> tuple[Mesh, BoolArray, IntArray]:
     """Elements between edges and groups, whether a group begins with one, and which it is in.
 
-    Edges at rows within a group are left out: ψ bends there at most, as the errors do. Behind each
-    of the edges ``starts`` elements are as short as the time since then.
+    Edges at rows within a group are left out: ψ bends there at most, as the errors do. Elements are
+    shorter behind those of the edges where laws start, ``starts`` (S,), ascending.
     """
     instants = groups.starts
     near = 1e-9 * float(np.diff(edges).min())
@@ -267,11 +268,14 @@ def _mesh(
     own = instants[~among(instants, edges, near)]
     own = own[(own > edges[0]) & (own < edges[-1])]
     coarse = np.union1d(edges[inner], own)
-    parts = int(np.clip(np.ceil(_ELEMENTS / (len(coarse) - 1)), 1, _MOST_PARTS))
     first = np.searchsorted(coarse, starts).clip(max=len(coarse) - 2)
-    early = coarse[first, None] + np.diff(coarse)[first, None] * 0.5 ** np.arange(1, _HALVINGS)
-    mesh = Mesh(np.union1d(coarse, early), radau_rule(_STAGES))
-    mesh, _ = mesh.split(np.full(mesh.size, parts, dtype=np.intp))
+    begun = coarse[first]
+    early = np.diff(coarse)[first, None] * 0.5 ** np.arange(1, _HALVINGS)
+    early[early < _SHORTEST * np.abs(coarse).max()] = 0.0
+    mesh = Mesh(np.union1d(coarse, begun[:, None] + early), radau_rule(_STAGES))
+    since = mesh.edges[1:] - begun[np.searchsorted(begun, mesh.edges[1:]).clip(1) - 1]
+    parts = np.maximum(_ELEMENTS / (len(coarse) - 1), _SINCE * mesh.steps / since)
+    mesh, _ = mesh.split(np.ceil(parts).clip(max=_MOST_PARTS).astype(np.intp))
     group = np.searchsorted(instants - near, mesh.edges[:-1], side="right").clip(1) - 1
     return mesh, np.diff(group, prepend=-1) > 0, group
 
