@@ -69,6 +69,23 @@ def test_the_mean_of_white_samples():
     np.testing.assert_allclose(of_x[:, 0], 2.0 * expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("rate", [1e-2, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e10])
+def test_an_estimate_that_follows_samples_at_once_does_so_between_them(rate):
+    """s' = λ(e − s): of s at a sample e^{−λt} is left, and the rest is its new error."""
+    sigma, step = 0.3, 0.5
+    t = np.unique(np.concatenate([np.linspace(0.01, 9.99, 297), 1.5 + np.logspace(-9, -1, 9)]))
+    found, _ = deviations(
+        directly, lambda *_: ErrorSystem(*np.array([-rate, rate, 1.0, 0.0]).reshape(4, 1, 1, 1)),
+        np.ones((len(t), 1, 1)), np.linspace(0, 10, 5), Rows(np.arange(20) * step),
+        np.array([sigma**2]), t,
+    )
+    whole = np.floor(t / step + 1e-12)
+    held, old = np.exp(-rate * step), np.exp(-rate * (t - whole * step))
+    before = (1.0 - held) ** 2 * (1.0 - held ** (2.0 * whole)) / -np.expm1(-2.0 * rate * step)
+    expected = sigma * np.sqrt(old**2 * before + (1.0 - old) ** 2)
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-3, atol=1e-3 * sigma)
+
+
 def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
     """White samples around a constant: the estimate of σ² has no bias, for as few as five."""
     mesh_edges = np.linspace(0.0, 5.0, 6)

@@ -17,7 +17,7 @@ from gpebo_cli.configs import configuration
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
-from gpebo_cli.findings import Assumption
+from gpebo_cli.findings import Assumption, replaced
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
@@ -293,7 +293,7 @@ class Result:
         chosen = figures if isinstance(figures, bool) else list(figures)
         settings = self.details.settings
         output = replace(settings.output, figures=chosen)
-        details = replace(self.details, settings=replace(settings, output=output))
+        details = replaced(self.details, settings=replace(settings, output=output))
         word = (None if chosen else "none") if isinstance(chosen, bool) else chosen
         name = str(self.config["estimator"]["name"])
         own = self.details.settings.data.frame is not None

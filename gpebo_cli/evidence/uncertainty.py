@@ -37,6 +37,8 @@ _MOST_PARTS = 8
 _SINCE = 32  # parts at least of that time
 _HALVINGS = 8  # of the first row there
 _SHORTEST = 1e-12  # of the times: where an element is shorter, its nodes are rounding
+_LONGER = 2.5  # times as long as the element before it is each one in a layer behind a sample
+_LOOKED = 16  # elements, about, in which rates are looked at
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
@@ -87,7 +89,10 @@ def _propagated(
 ) -> tuple[Array, Array]:
     """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
     n, p = gain.shape[1:]
-    mesh, fresh, group = _mesh(edges, groups, np.union1d(starts, [time for time, _ in resets]))
+    mesh = _mesh(edges, groups, np.union1d(starts, [time for time, _ in resets]))
+    some = _joint(observer, estimator, mesh, slice(None, None, -(-mesh.size // _LOOKED)), n)
+    mesh = _layered(mesh, groups.starts, _rate(some), t)
+    fresh, group = _group_of(mesh, groups.starts)
     until = np.append(groups.starts[1:], np.inf)
     sampler = mesh.sampler(t)
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
@@ -255,8 +260,8 @@ def noise_level(
     return float(np.sqrt(square / left)) if more and left > _LEFT * whole else np.nan
 
 
-def _mesh(edges: Array, groups: Groups, starts: Array) -> tuple[Mesh, BoolArray, IntArray]:
-    """Elements between edges and groups, whether a group begins with one, and which it is in.
+def _mesh(edges: Array, groups: Groups, starts: Array) -> Mesh:
+    """Elements between edges and groups.
 
     Edges at rows within a group are left out: ψ bends there at most, as the errors do. Elements are
     shorter behind those of the edges where laws start, ``starts`` (S,), ascending.
@@ -275,9 +280,37 @@ def _mesh(edges: Array, groups: Groups, starts: Array) -> tuple[Mesh, BoolArray,
     mesh = Mesh(np.union1d(coarse, begun[:, None] + early), radau_rule(_STAGES))
     since = mesh.edges[1:] - begun[np.searchsorted(begun, mesh.edges[1:]).clip(1) - 1]
     parts = np.maximum(_ELEMENTS / (len(coarse) - 1), _SINCE * mesh.steps / since)
-    mesh, _ = mesh.split(np.ceil(parts).clip(max=_MOST_PARTS).astype(np.intp))
-    group = np.searchsorted(instants - near, mesh.edges[:-1], side="right").clip(1) - 1
-    return mesh, np.diff(group, prepend=-1) > 0, group
+    return mesh.split(np.ceil(parts).clip(max=_MOST_PARTS).astype(np.intp))[0]
+
+
+def _rate(joint: ErrorSystem) -> float:
+    """The fastest rate, in 1/s, of what the errors of samples move directly."""
+    moved = joint.B.any(axis=3)
+    return float(np.abs(np.einsum("ksii->ksi", joint.A)[moved]).max(initial=0.0))
+
+
+def _layered(mesh: Mesh, instants: Array, rate: float, t: Array) -> Mesh:
+    """With short elements behind samples, where what follows them with this ``rate`` makes a layer.
+
+    The end of an element beyond the layer is accurate, but no polynomial goes through both of its
+    ends. Only elements in which there are times of the output t (M,) are cut.
+    """
+    begins, sampler = _group_of(mesh, instants)[0], mesh.sampler(t)
+    between = np.count_nonzero(sampler.weights, axis=1) > 1  # and not at a node
+    begins &= np.bincount(sampler.element[between], minlength=mesh.size) > 0
+    h, left = mesh.steps[begins], mesh.edges[:-1][begins]
+    fast = rate * h.max(initial=0.0)
+    cuts = int(np.ceil(np.log(max(fast, 1.0)) / np.log(_LONGER)))
+    parts = h * _LONGER ** -np.arange(1.0, 1.0 + cuts)[:, None]
+    useful = (rate * parts * _LONGER > 1.0) & (parts > _SHORTEST * np.abs(mesh.edges).max())
+    return Mesh(np.union1d(mesh.edges, (left + parts)[useful]), mesh.rule)
+
+
+def _group_of(mesh: Mesh, instants: Array) -> tuple[BoolArray, IntArray]:
+    """Whether a group, each from its instant on, begins with an element, and which it is in."""
+    middle = mesh.edges[:-1] + 0.5 * mesh.steps
+    group = np.searchsorted(instants, middle, side="right").clip(1) - 1
+    return np.diff(group, prepend=-1) > 0, group
 
 
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:

@@ -45,7 +45,7 @@ from gpebo_cli.experiment.uncertainty import (
     standard_deviations,
 )
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
-from gpebo_cli.findings import Requirement
+from gpebo_cli.findings import Requirement, replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
@@ -172,7 +172,7 @@ def _completed(
     notes = observed.note + note + simulation_note(simulation, result.settings.solver.tol)
     notes += functions_note(system, simulation or recording)
     notes += recording.note if recording else ""
-    return replace(  # once: a copy asks for everything that is not replaced
+    return replaced(
         result, excitation=excitation, estimation=estimation, metrics=metrics, settings=settings,
         regression=regression, fit=fit, noise=noise, left_out=left_out, estimable=estimable,
         assumptions=lambda: (*of_source(), *of_observer()),
@@ -188,7 +188,8 @@ def _with_deviations(
     """With standard deviations, or why there are none (not, if nobody asked)."""
     if isinstance(observation.state_map, Filtering):
         of_eta, of_x = observation.state_map.deviations(estimation.t)
-        return replace(estimation, parameters_std=of_eta[None], states_std=of_x[None]), ""
+        std = np.concatenate([of_eta, of_x], axis=1)[None]
+        return estimation.with_deviations(std), ""
     if not settings.uncertainty or observation.estimator is not None:
         return estimation, ""
     some, columns = _about(observation, known.independent)

@@ -7,7 +7,7 @@ tables, figures and ``summary.json``; nothing in here knows about files, pandas 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
-from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated
+from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated, replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.settings import Settings
 
@@ -141,7 +141,7 @@ class EstimationResult:
     def with_deviations(self, std: Array | None) -> EstimationResult:
         """The same with deviations (G, M, p + n); None: nobody knows."""
         of_eta, of_x = (None, None) if std is None else np.split(std, [len(self.names)], axis=2)
-        return replace(self, parameters_std=of_eta, states_std=of_x)
+        return replaced(self, parameters_std=of_eta, states_std=of_x)
 
     @cached_property
     def gains(self) -> dict[str, Array]:
