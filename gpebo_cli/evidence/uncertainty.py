@@ -30,14 +30,14 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression, integrating
 
-_STAGES = 4  # order 7: a deviation needs three digits, and elements end at the samples
-_ELEMENTS = 400  # about so many at least
+_STAGES = 5  # order 9: a deviation needs three digits, and elements end at the samples
+_ELEMENTS = 200  # about so many at least
 _MOST_PARTS = 8
 # Behind a start laws may go as a power of the time since then.
-_SINCE = 32  # parts at least of that time
+_SINCE = 24  # parts at least of that time
 _HALVINGS = 8  # of the first row there
 _SHORTEST = 1e-12  # of the times: where an element is shorter, its nodes are rounding
-_LONGER = 2.5  # times as long as the element before it is each one in a layer behind a sample
+_LONGER = 3.0  # times as long as the element before it is each one in a layer behind a sample
 _LOOKED = 16  # elements, about, in which rates are looked at
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
