@@ -167,6 +167,18 @@ def test_result_does_not_depend_on_the_restarts():
     assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
 
 
+def test_many_elements_take_few_stages_and_lose_nothing():
+    """Where samples have made elements short, a high order would be paid for nothing."""
+    case, start, P0, t = varying(), np.zeros(3), 10.0 * np.eye(3), np.linspace(0.5, 20.0, 40)
+    few, many = (case.filtered(start, P0, 20.0, elements) for elements in (20, 1000))
+    assert (few.mesh.rule.stages, many.mesh.rule.stages) == (12, 6)
+    assert many.mesh.size < 1500  # shorter ones where P falls, at the start
+    assert many.error_estimate < 1e-9
+    (P, x), (Q, y) = few.at(t), many.at(t)
+    assert relative(P, Q) < 1e-9
+    assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
+
+
 def test_without_noise_on_the_state_it_is_recursive_least_squares():
     """Q = 0: P⁻¹ = P₀⁻¹ + ∫cᵀV⁻¹c, ζ̂ = P (P₀⁻¹ζ̂₀ + ∫cᵀV⁻¹z) for constant ζ."""
     case = Case(

@@ -46,6 +46,8 @@ _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
 _UNSEEN = 1e-12  # of P, by which measurements change it over the horizon: as much as none
 _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
 _STAGES = 8  # at least, at first: P falls fast from where it starts, whatever a mesh was made for
+_MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages that they need
+_ROOM = 8  # times as many elements may be needed with few stages
 _GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
 
 
@@ -199,6 +201,8 @@ def run_filter(
     try:
         # P may fall in less than times far from zero are told apart.
         stages, begin = max(mesh.rule.stages, 0 if before else _STAGES), mesh.edges[0]
+        if _MANY < mesh.size < max_elements / _ROOM:
+            stages = min(stages, _FEW)
         mesh = Mesh(mesh.edges - begin, radau_rule(stages), mesh.origin + begin)
         solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
         P, estimate = quotient(solution.trajectory.values)
