@@ -38,6 +38,7 @@ _SINCE = 24  # parts at least of that time
 _HALVINGS = 8  # of the first row there
 _SHORTEST = 1e-12  # of the times: where an element is shorter, its nodes are rounding
 _LONGER = 3.0  # times as long as the element before it is each one in a layer behind a sample
+_FASTEST = 0.1 / float(np.finfo(float).eps)  # rates times the horizon: their rounding moves s
 _LOOKED = 16  # elements, about, in which rates are looked at
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
@@ -62,7 +63,8 @@ def deviations(
     of Y to those of η̂; the gain is that of x = offset + gain η (M, n, p). ψ is smooth between
     ``edges`` (K + 1,), in seconds, and ``variances`` are those of [u; y] in each of the rows (m +
     r,). ζ begins anew at the edges ``starts``, of several experiments; None: at the first one only.
-    At the times of ``resets`` a matrix (S, k + S) makes s of [ζ; s], and ζ is zero.
+    At the times of ``resets`` a matrix (S, k + S) makes s of [ζ; s], and ζ is zero. They are NaN
+    where errors move s so fast that rounding decides how slow the rest of it is.
     """
     most = 1 if resets else len(rows.t) // _GROUPS
     per, before = _PER_ELAPSED, list[Array]()
@@ -91,7 +93,9 @@ def _propagated(
     n, p = gain.shape[1:]
     mesh = _mesh(edges, groups, np.union1d(starts, [time for time, _ in resets]))
     some = _joint(observer, estimator, mesh, slice(None, None, -(-mesh.size // _LOOKED)), n)
-    mesh = _layered(mesh, groups.starts, _rate(some), t)
+    if (rate := _rate(some)) * (edges[-1] - edges[0]) > _FASTEST:
+        return np.full((len(t), p), np.nan), np.full((len(t), n), np.nan)
+    mesh = _layered(mesh, groups.starts, rate, t)
     fresh, group = _group_of(mesh, groups.starts)
     until = np.append(groups.starts[1:], np.inf)
     sampler = mesh.sampler(t)
