@@ -16,6 +16,7 @@ import yaml
 from gpebo_cli.errors import ConfigError
 
 _MAX_DEPTH = 50
+_DEEP = f"nested more than {_MAX_DEPTH} levels deep"
 _MAX_ENTRIES = 200_000  # aliases expanded; OmegaConf builds some 20,000 a second
 
 _Parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # libyaml is 10 times as fast
@@ -32,6 +33,8 @@ def parse(text: str, path: str, *, ours: bool = False) -> Any:
         mark = getattr(error, "problem_mark", None)
         where = path if mark is None else f"{path}, line {mark.line + 1}"
         problem = getattr(error, "problem", None) or getattr(error, "reason", None) or error
+        if "nesting depth" in str(problem):  # libyaml looks ahead, and has a limit of its own
+            raise ConfigError(f"{where}: {_DEEP}") from error
         raise ConfigError(f"{where}: not valid YAML: {problem}") from error
 
 
@@ -83,7 +86,7 @@ class _Builder:
     def _inside(self, event: yaml.NodeEvent, depth: int) -> Iterator[Any]:
         """The events with which begins what a collection holds."""
         if depth >= _MAX_DEPTH:
-            self._refuse(event, f"nested more than {_MAX_DEPTH} levels deep")
+            self._refuse(event, _DEEP)
         while not isinstance(inner := next(self._events), yaml.CollectionEndEvent):
             yield inner
 
