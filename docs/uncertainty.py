@@ -113,7 +113,7 @@ def coverage() -> str:
             known = found.predicted > 1e-9
             within = np.abs(found.errors) <= 1.96 * found.predicted[..., None]
             share = 100.0 * within.mean(axis=2)[known]
-            ratio = (found.predicted / found.errors.std(axis=2, ddof=1))[known]
+            ratio = found.predicted[known] / found.errors.std(axis=2, ddof=1)[known]
             own = ", ".join(f"{k}={v:g}" for k, v in settings.items() if not isinstance(v, str))
             label = f"{settings['name']}" + (f" ({own})" if own else "")
             covered = f"{share.min():.1f} … {share.max():.1f} %"
