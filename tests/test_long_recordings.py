@@ -284,6 +284,21 @@ def test_noise_in_the_matrices_is_named_and_may_be_taken_out():
     assert "in the matrices" not in wrong
 
 
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])
+def test_a_law_that_is_not_done_is_no_fault_of_the_model(observer):
+    """Least squares of the same data explain them; what γ leaves is not a sensor that fails."""
+    made = run("battery", observer="none", time={"horizon": 20.0, "samples": 201})
+    noise = 1e-3 * np.random.default_rng(0).standard_normal(201)
+    data = {"t": made.t, **made.inputs, "v": made["v"] + noise}
+    given = {"data": data, "observer": observer}
+    least = run("battery", estimator="least_squares", **given)
+    slow = run("battery", estimator="gradient", gamma=1e-3, **given)
+    told = f"least squares of the same data leave {least.details.fit.least:.2g}: what is left says"
+    assert told in slow.verdict
+    assert "suggests" not in slow.verdict
+    assert "least squares of" not in least.verdict
+
+
 def test_an_output_that_is_used_up_for_a_state_is_no_residual():
     """The circuit's iv is y less il: rounding is left, in which no pattern means anything."""
     made = run("circuit", observer="none", time={"samples": 401})

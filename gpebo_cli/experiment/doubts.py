@@ -20,7 +20,7 @@ UNFINISHED = (  # why there are no deviations
     "what the estimator needs is not met, and estimates are farther from least squares over the "
     "same data than noise brings them; use estimator=least_squares or other gains"
 )
-_WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
+WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
 _TINY = float(np.finfo(float).tiny)
 _STILL = 1e-9  # of what would explain Y alone: one that moved by less was not moved by data
 
@@ -114,7 +114,7 @@ def of_estimates(
     rest = np.exp(-requirement.evidence.get("gamma_times_integral", 0.0))
     limit = min(_ASTRAY, max(_EXACT, _DONE * rest))
     far = determined & (away > limit * own)
-    far &= requirement.holds and bool(more[best] > _WORSE * least)
+    far &= requirement.holds and bool(more[best] > WORSE * least)
     told = {name: found[name] for name in compress(quantities, determined)}
     if not far.any():
         return told, ()

@@ -38,8 +38,10 @@ def fit_of(
     def rms(eta: Array) -> float:
         return float(np.sqrt(regression.misfit(eta) / duration))
 
-    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)))
-    if regression.resets or regression.dynamics is not None:
+    changing = bool(regression.resets) or regression.dynamics is not None
+    least = np.nan if changing else rms(regression.least_squares())
+    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)), least)
+    if changing:
         return fit
     return _explained(
         fit, final[fit.best], about, system, source,

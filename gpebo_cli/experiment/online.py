@@ -25,6 +25,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
 from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
+from gpebo_cli.regression.linear import least_squares
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import Settings
 
@@ -278,9 +279,10 @@ class Online:
         """How the last estimates explain all data, from S alone: |Y − ψη̂|² = |S[−η̂; 1]|²."""
         final, root = self._final, self.root
         duration = max(self.reached.t - self.start, float(np.finfo(float).tiny))
-        vectors = np.concatenate([-final, np.ones((len(final), 1))], axis=1)
-        residual = np.linalg.norm(vectors @ root.T, axis=1) / np.sqrt(duration)
-        return Fit(residual, float(np.linalg.norm(root[:, -1]) / np.sqrt(duration)))
+        each = np.stack([*final, np.zeros(root.shape[1] - 1), least_squares(root)])
+        vectors = np.concatenate([-each, np.ones((len(each), 1))], axis=1)
+        *residual, size, least = np.linalg.norm(vectors @ root.T, axis=1) / np.sqrt(duration)
+        return Fit(np.array(residual), float(size), float(least))
 
     @property
     def reached(self) -> observers.Reached:

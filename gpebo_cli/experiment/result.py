@@ -169,6 +169,7 @@ class Fit:
 
     residual: Array  # (G,) root mean square over time of ‖Y − ψη̂(end)‖
     size: float  # the same of ‖Y‖
+    least: float  # the same with least squares of the same data; NaN where η changes
     outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     slow: bool = False  # whether more of it than of white noise varies slowly

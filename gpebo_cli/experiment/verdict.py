@@ -9,6 +9,7 @@ import numpy as np
 
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
+from gpebo_cli.experiment.doubts import WORSE
 from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
@@ -76,6 +77,12 @@ def verdict(
 
 def _explains(fit: Fit, case: int) -> str:
     """What the residual says of the model."""
+    residual = fit.residual[case]
+    if residual > WORSE * fit.least and residual > _EXACT * fit.size:
+        return (
+            f", where least squares of the same data leave {fit.least:.2g}: what is left says "
+            "more of these estimates than of the model"
+        )
     noise, why = "", "a missing or wrong parameter, a drifting sensor, or a delay"
     if fit.ratio is not None:
         noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
@@ -83,7 +90,7 @@ def _explains(fit: Fit, case: int) -> str:
         if fit.ratio is None:
             return ""
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
-    if fit.residual[case] <= _EXACT * fit.size:
+    if residual <= _EXACT * fit.size:
         return ": the estimates explain the data"
     if fit.far:
         told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
