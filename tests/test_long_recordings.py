@@ -28,7 +28,7 @@ from gpebo_cli.regression import linear
 from gpebo_cli.regression.estimator import Lasting, Unmixed
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
-from tests.plants import shipped
+from tests.plants import one_state, shipped
 from tests.regressions import ETA, regression, three
 
 STEP = {  # its A jumps, between samples and away from wanted times
@@ -260,7 +260,19 @@ def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
     white = rng.standard_normal((300, 1000, 2))
     wave = 0.25 * np.sin(np.linspace(0.0, 12.0, 1000))[:, None]
     assert np.mean([_varies_slowly(e) for e in white]) < 0.04
-    assert np.mean([_varies_slowly(e + wave) for e in white]) > 0.9
+    for misfit in (wave, 0.13):
+        assert np.mean([_varies_slowly(e + misfit) for e in white]) > 0.9
+
+
+def test_what_a_sensor_shows_too_much_at_all_times_is_told():
+    """Six deviations of the mean, a fifth of the noise of one sample."""
+    plant = one_state(A=[[-1]], phi=["sin(t)"])
+    made = run(plant, observer="none", time={"samples": 1001})
+    noise = 0.05 * np.random.default_rng(1).standard_normal(1001)
+    for offset, white in ((0.0, True), (0.01, False)):
+        data = {"t": made.t, "y": made["y"] + noise + offset}
+        result = run(plant, data=data, estimator="least_squares")
+        assert result.details.fit.white is white
 
 
 def test_noise_in_the_matrices_is_named_and_may_be_taken_out():

@@ -52,14 +52,14 @@ def fit_of(
 def _varies_slowly(residual: Array) -> bool:
     """Whether a residual (N, r) has more in its slowest cosines than white noise.
 
-    In its slowest 4, 8, 16, …: what is small and slow hides from single lags.
+    In its mean, and in its slowest 4, 8, 16, …: what is small and slow hides from single lags.
     """
     from scipy.fft import dct  # as long to import as a small run takes
     from scipy.special import fdtrc
 
-    spectrum = dct(residual, axis=0, norm="ortho")[1:] ** 2
+    spectrum = dct(residual, axis=0, norm="ortho") ** 2
     (count, outputs), slow = spectrum.shape, len(spectrum) // _SLOW
-    some = 2 ** np.arange(2, slow.bit_length())
+    some = np.append(1, 2 ** np.arange(2, slow.bit_length()))
     sums = (spectrum / spectrum[slow:].mean(axis=0)).sum(axis=1).cumsum()[some - 1]
     chances = fdtrc(some * outputs, (count - slow) * outputs, sums / (some * outputs))
     return bool(chances.min(initial=1.0) < _RARE)
@@ -110,9 +110,9 @@ def _explained(
     step = float(t[-1] - t[0]) / (len(t) - 1)
     stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]
-    residual = residual - residual.mean(axis=0)
-    typical = np.median(np.abs(residual), axis=0) / 0.6745  # σ of normal noise, whatever few do
-    far = (np.abs(residual) > _FAR * typical) & (typical > 0.0)
+    away = np.abs(residual - residual.mean(axis=0))
+    typical = np.median(away, axis=0) / 0.6745  # σ of normal noise, whatever few do
+    far = (away > _FAR * typical) & (typical > 0.0)
     residual[far] = 0.0  # and hides nothing of the others
     power = (residual**2).sum(axis=0)
     # What an output is used up for leaves rounding, which is no noise.
