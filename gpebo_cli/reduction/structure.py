@@ -29,7 +29,7 @@ _DIP = 0.2  # a singular value that falls below this share of its maximum is fol
 _DIP_ROUNDS = 14
 _FALL = 1e-2  # towards an end of the horizon, singular values may fall to this share
 _DIP_POINTS = 17
-_MOST_DIPS = 6  # of each kind
+_MOST_DIPS = 32  # of each kind: bounds have some of their own, where pivots fail
 _LOOKED_AHEAD = 400  # rows of a derivative array beyond the limit of differentiations
 
 
@@ -200,26 +200,30 @@ def _in_stages(
     def lines(t: Array, c: Coefficients, column: IntArray) -> Array:
         try:
             smallest = found(c).smallest
-        except UnclearError as unclear:
-            raise unclear_ranks(system, t, unclear) from unclear
-        return np.asarray(smallest.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column])
+        except UnclearError as unclear:  # everything is clear away from there
+            raise unclear_ranks(system, t, UnclearError(unclear.place)) from unclear
+        lines = smallest.reshape(-1, _DIP_POINTS, 4)[range(len(column)), :, column]
+        return np.where(column[:, None] == 3, lines / largest, lines)
 
     while True:
         c = system.coefficients.taylor(t, mu)
         try:
             stages = found(c)
-        except UnclearError as unclear:
-            rounding = unclear.rounding
+        except UnclearError as error:
+            unclear = error
         else:
-            rounding = True
-            if stages.smallest.min() > max(_BLURRED, least):
+            unclear = UnclearError(0, rounding=True)
+            values = stages.smallest[:, :3].min(axis=1)
+            # What is blurred at a few times only is on its way to zero, or is seen not to be.
+            if np.median(values) > _BLURRED and values.min() > least:
                 break
         if mu == max_mu:
-            if rounding and not least:
-                raise unclear_ranks(system, t, UnclearError(0, rounding=True))
+            if (unclear.rounding or unclear.sudden) and not least:
+                raise unclear_ranks(system, t, unclear)
             return None
         mu += 1
-    ranks = stages.ranks
+    ranks, largest = stages.ranks, float(stages.smallest[:, 3].max())
+    stages.smallest[:, 3] /= largest
     steady = len(t) == 1 or _follow_dips(system, t, stages.smallest, mu, rank_tol, lines)
     none, n, a = np.zeros(0, dtype=np.intp), system.n, stages.A2.shape[1]
     E, A = (matrix[0] * (s.rows[:, None] * s.columns) for matrix in (c.E, c.A))
@@ -227,7 +231,7 @@ def _in_stages(
     inverse, singular = inverse_or_none(np.concatenate([W1 @ E / s.time, stages.A2], axis=1))
     return Structure(
         mu=mu, a=a, d=n - a, scaling=s, rank_tol=rank_tol,
-        smallest_singular_value=float(stages.smallest.min()), time_invariant=len(t) == 1,
+        smallest_singular_value=float(stages.smallest[:, :3].min()), time_invariant=len(t) == 1,
         reference=Pivots(0, none, none, np.zeros((n, 0))), steady=steady,
         dynamics=None if singular.any() else W1 @ A @ inverse[:, :, : n - a] / s.time,
         stages=ranks,
@@ -389,7 +393,8 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
     """Dips of the singular values or bounds (N, 3), and whether there is none between the ends.
 
     A dip is a local minimum far below the column's maximum, given as its column and its place;
-    the deepest of each column come first. There is none in columns that are not finite.
+    the sharpest of each column come first, because beside a zero between two probes, however fast
+    it is passed, one is at most a third of the next. There is none in columns that are not finite.
     """
     steady, dips, size, least = True, [], smallest.max(axis=0), smallest.min(axis=0)
     for column in ((least < _DIP * size) & np.isfinite(size)).nonzero()[0].tolist():
@@ -399,8 +404,10 @@ def _dips(smallest: Array) -> tuple[bool, list[tuple[int, int]]]:
         deep[:-1] &= rises
         deep[1:] &= values[1:] <= values[:-1]
         places = deep.nonzero()[0]
+        before, after = np.maximum(places - 1, 0), np.minimum(places + 1, last)
+        sharp = (values[places] / np.maximum(values[before], values[after])).argsort()
         steady &= not deep[1:last].any() and bool(least[column] >= _FALL * size[column])
-        dips += [(column, k) for k in places[values[places].argsort()][:_MOST_DIPS].tolist()]
+        dips += [(column, k) for k in places[sharp][:_MOST_DIPS].tolist()]
     return steady, dips
 
 
@@ -439,7 +446,7 @@ def _follow_dips(
     steady, dips = _dips(smallest)
     if not dips:
         return steady
-    names = ("derivative array", "constraints", "differential part")
+    names = ("derivative array", "constraints", "differential part", "constraints")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
     lowest, zero = smallest[k, column], np.maximum(rank_tol, 1e-9 * smallest.max(axis=0))
