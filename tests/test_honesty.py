@@ -61,9 +61,12 @@ def test_a_rank_that_rounding_supports_is_not_taken_for_the_right_one(seed):
     assert found.ratio < 10.0
 
 
-def test_constraints_without_digits_are_refused():
-    """Index 4 beside a rate of 4e7."""
-    found = measure(case_of("stiff", 62))
+def test_a_rank_that_only_rounding_supports_is_refused():
+    """Index 4 beside a rate of 1.6e6: three differentiations seem to do, with states 4e8 times off.
+
+    One more finds other constraints, which it does not where their number is right.
+    """
+    found = measure(case_of("stiff", 379))
     assert "leaves no digit of its hidden constraints" in found.refused
 
 
