@@ -99,7 +99,7 @@ def _carried(rng, k=6, s=5, n=3, c=2, constant=False, still=False):
     return (
         values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
         rng.normal(size=(maps, n, n)), rng.normal(size=(k, n, c)), noise,
-        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), np.full(k, 0.1), 0.3, 8.0, 4.0, 1e-9,
+        rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), 0.3, 8.0, np.inf if constant else 4.0,
     )
 
 
@@ -393,7 +393,7 @@ def test_arguments_that_are_no_such_arrays_are_refused(subject, name, case):
     ("chain", _maps, 0, np.s_[:-1]),
     ("chain", _maps, 1, np.s_[:, :-1]),
     ("chain", _maps, 2, np.s_[:-1]),
-    *(("carried_errors", _carried, place, np.s_[:-1]) for place in (1, 3, 4, 5, 6, 7)),
+    *(("carried_errors", _carried, place, np.s_[:-1]) for place in (1, 3, 4, 5, 6)),
     *(("carried_errors", _carried, place, np.s_[:, :-1]) for place in (0, 3, 4, 5, 6)),
     *(("stiff", _stiff, place, np.s_[:-1]) for place in (0, 1, 2, 5, 6, 7, 8)),
     ("tails", _signal, 1, np.s_[:-1]),

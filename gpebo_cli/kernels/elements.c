@@ -260,12 +260,12 @@ EVERY_WIDTH static void own_errors(const Call *call, npy_intp k, double *shown, 
             made_of += fabs(last[i * n + j]) * fabs(values[j * c + b]);
             rounding += noise[i * (n + c) + j] * size[j * c + b];
         }
-        const int visible = rows == 4 && pairs[1] >= call->number[8] * pairs[0];
+        const int visible = rows == 4 && pairs[1] >= call->number[7] * pairs[0];
         const double found[] = {size[e] * share, size[e], visible ? pairs[1] : 0.0, made_of};
         for (npy_intp m = 0; m < 4; m++)
             most[m * C + e] = larger(most[m * C + e], found[m]);
         kinds[e] = found[0] * pow(share, 0.5 - 0.5 / stages);
-        kinds[C + e] = DBL_EPSILON * (call->number[9] * made_of + rounding);
+        kinds[C + e] = DBL_EPSILON * (call->number[8] * made_of + rounding);
     }
 }
 
@@ -273,21 +273,16 @@ EVERY_WIDTH static void own_errors(const Call *call, npy_intp k, double *shown, 
 static Outcome carried_errors(Call *call)
 {
     const npy_intp K = SIZE(K), n = SIZE(n), c = SIZE(c), C = n * c, S = SIZE(w) / 2, N = 2 * n * S;
-    const double *noise = call->in[5], *h = call->in[7], *sign = call->in[6];
+    const double *sign = call->in[6];
     double *kinds = scratch(call, 7 * C + 3 * N * c), *most = call->out[1];
     if (K < 1)
         return refused("elements", K);
     if (kinds == NULL)
         return ERROR;
     double *shown = kinds + 2 * C, *error = shown + 5 * C, *added = error + N * c;
-    double *next = added + N * c, chance = HUGE_VAL;
+    double *next = added + N * c;
+    const double most_factor = call->number[9];
     memset(most, 0, 5 * C * sizeof(double));
-    for (npy_intp k = 0; k < (call->step[5] ? K : 1); k++)
-        for (npy_intp i = 0; i < n * (n + c); i++) {
-            const double first = noise[i] / h[0], rate = noise[k * call->step[5] + i] / h[k];
-            if (i % (n + c) < n && !(fabs(rate - first) <= call->number[11] * first))
-                chance = call->number[10]; /* errors of what moves differ in their signs */
-        }
     for (npy_intp i = 0; i < N * c; i++)
         error[i] = i / c / S % 2
                        ? sign[i / c] * DBL_EPSILON * fabs(call->in[0][i / c / S / 2 * c + i % c])
@@ -305,7 +300,7 @@ static Outcome carried_errors(Call *call)
                 const double one = error[(e / c * 2 * S + s) * c + e % c];
                 sum[s / S] += one * one;
             }
-            const double factor = (double)(k + 2), other = factor < chance ? factor : chance;
+            const double factor = (double)(k + 2), other = factor < most_factor ? factor : most_factor;
             const double found = sqrt(sum[0] * (factor / S)) + sqrt(sum[1] * (other / S));
             call->out[0][k * C + e] = found;
             most[e] = larger(most[e], found);
@@ -652,7 +647,7 @@ EVERY_WIDTH static Outcome stiff(Call *call)
 const Kernel element_kernels[] = {
     {"element_maps", "ss K |P?dn P?dn P?dc |P?nd |P?nc @K %g", "gsnn Ksnc", element_maps},
     {"chain", "K?snn Ksnc nc", "Ks+nc 1", chain},
-    {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw K # # # # v=n+c", "Knc 5nc", carried_errors},
+    {"carried_errors", "Ktnc tt u K?nn K?nc K?nv K+nw # # # v=n+c", "Knc 5nc", carried_errors},
     {"series", "s K @K @d+ @e P?eg P?g P?udf |Kdc dc d # #", "Ks+dc K", series},
     {"stiff", "ss K @B @o4 @m3 P?e Q?df |Kdc dc", "Ks+dc", stiff},
     {NULL, NULL, NULL, NULL},

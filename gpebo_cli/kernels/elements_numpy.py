@@ -108,7 +108,7 @@ def chain(
 
 def carried_errors(
     values: Array, to_legendre: Array, powers: Array, last: Array, particular: Array, noise: Array,
-    signs: Array, h: Array, level: float, end: float, chance: float, same: float,
+    signs: Array, level: float, end: float, most_factor: float,
 ) -> tuple[Array, Array]:
     """How far errors of elements may be carried, and what else counts of the solution.
 
@@ -120,11 +120,10 @@ def carried_errors(
     them, ``powers`` (j,) of each of the last ones the next. ``last`` (K or 1, n, n) are maps from
     left to right ends, ``particular`` (K or 1, n, c) right ends from zero, ``noise`` that of the
     terms in an element, see :func:`numerics.errors.estimated_errors`, ``signs`` those of each kind
-    of error at the start and the ends (K + 1, n, 2 S), and h lengths (K,). Coefficients that fall
-    by less than ``level`` over two degrees are noise; ``end`` units in the last place are lost in
-    solving an element; a sum of independent errors may exceed its root mean square by √``chance``;
-    rates that differ by less than ``same`` are constant: errors may then be wrong in the same
-    direction each time.
+    of error at the start and the ends (K + 1, n, 2 S). Coefficients that fall by less than
+    ``level`` over two degrees are noise; ``end`` units in the last place are lost in solving an
+    element. The sum of k errors may exceed its root mean square by √k; where it is rounding, by the
+    root of the ``most_factor``.
 
     Returns:
         bounds of the errors at right ends (K, n, c); and the largest over time (5, n, c) of these,
@@ -156,9 +155,7 @@ def carried_errors(
         for k in range(K):
             ends[k] = error = last[k if len(last) > 1 else 0] @ error + added[k]
         squares = np.square(ends).reshape(K, n, 2, S, columns).sum(axis=3)
-        rates = noise[..., :n] / h[: len(noise), None, None]
-        constant = (np.abs(rates - rates[0]) <= same * rates[0]).all()
-        most_of = np.array([np.inf, np.inf if constant else chance])[:, None]
+        most_of = np.array([np.inf, most_factor])[:, None]
         factors = np.minimum(np.arange(2.0, K + 2.0)[:, None, None, None], most_of)
         np.sqrt(squares * (factors / S)).sum(axis=2, out=carried)
         return carried, most.max(axis=1)

@@ -67,7 +67,8 @@ class LinearSolution:
 
 # X at the nodes of each element = ``homogeneous`` X(left end) + ``particular``: the first one
 # (K, s, n, n), or (1, s, n, n) if it is the same for all; the second (K, s, n, columns); ``noise``
-# (K, n, n + columns), see estimated_errors; and extras (K, s + 1, ...), or (1, 1, ...) if constant.
+# (K, n, n + 2 columns), see estimated_errors; and extras (K, s + 1, ...), or (1, 1, ...) where they
+# are constant.
 _Maps = list[Array]
 
 
@@ -295,8 +296,9 @@ def _solve_elements(
 def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     """By how much relative rounding of each component, and of 1, may move X within an element.
 
-    h times what T brings of |A| and |f|, or of their terms; and what rounding of the times t (k, s
-    + 1) makes of A and f that move. Shape (k, n, n + columns); zero where E is not invertible.
+    h times what T brings of |A| and |f|, or of their terms; what rounding of the times t (k, s + 1)
+    makes of A that moves; and, apart, what it makes of f, and of A times what constraints say, that
+    move. Shape (k, n, n + 2 columns); zero where E is not invertible.
     """
     k, s = len(h), t.shape[1] - 1
     d, n = c.A.shape[1:]
@@ -305,9 +307,15 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     whole[..., :n] = at_points(c.A, k, s).swapaxes(0, 1)
     whole[..., n:] = at_points(c.f, k, s).swapaxes(0, 1)
     high, low = whole.max(axis=0), whole.min(axis=0)
-    found = np.maximum(high, -low)
+    found, moved = np.maximum(high, -low), np.abs(t[:, -1, None, None]) * (high - low)
+    of_time = moved[..., n:]
+    if c.constraints is not None:
+        p = at_points(c.constraints.offset, k, s)
+        swing = p.max(axis=1) - p.min(axis=1)
+        of_time = of_time + found[..., :n] @ (np.abs(t[:, -1, None, None]) * swing)
     found = h[:, None, None] * (found if c.terms is None else np.maximum(found, c.terms))
-    found += np.abs(t[:, -1, None, None]) * (high - low)
+    found[..., :n] += moved[..., :n]
+    found = np.concatenate([found, of_time], axis=2)
     if c.constraints is not None:
         return np.asarray(largest_within(at_points(c.constraints.basis, k, s)) @ found)
     if c.E is None:
@@ -326,9 +334,8 @@ def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
     after = np.searchsorted(mesh.edges, cuts)
     slopes = solution.derivative().values
     found = np.array(np.broadcast_to(noise, (mesh.size, *noise.shape[1:])))
-    found[after, :, n:] += np.abs(cuts)[:, None, None] * np.abs(
-        slopes[after, 0] - slopes[after - 1, -1]
-    )
+    jumps = np.abs(slopes[after, 0] - slopes[after - 1, -1])
+    found[after, :, n : n + jumps.shape[2]] += np.abs(cuts)[:, None, None] * jumps
     return found
 
 

@@ -70,15 +70,23 @@ def estimated_errors(
     """Errors of the point values (K, s + 1, n, columns) of a solution.
 
     Of maps from left ends to right ends, ``last`` (K or 1, n, n), right ends from zero,
-    ``particular`` (K, n, columns), and ``noise`` (K or 1, n, n + columns): what the terms of the
-    equation, [of each component, and alone], can bring about in an element; relative rounding of
-    them is an error.
+    ``particular`` (K, n, columns), and ``noise`` (K, n, n + 2 columns): what the terms of the
+    equation, [of each component, alone, and alone by rounding of the time], can bring about in an
+    element; relative rounding of them is an error.
     """
-    rule = mesh.rule
-    noise[:, :, values.shape[2] :] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
+    rule, (n, columns), most = mesh.rule, problem.start.shape, CHANCE**2
+    of_all, of_time = noise[..., : n + columns], noise[..., n + columns :]
+    of_all[..., n:] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
+    rates = of_all[..., :n] / mesh.steps[:, None, None]
+    if (np.abs(rates - rates[0]) <= _SAME * rates[0]).all():
+        # Rounding of what is constant may be wrong in the same direction each time; that of times
+        # is not, and comes with the share that the bound for all elements before has of this.
+        before = np.arange(2.0, len(noise) + 2.0)
+        of_time, most = of_time * np.sqrt(np.minimum(most / before, 1.0))[:, None, None], np.inf
+    of_all[..., n:] += of_time
     carried, largest = elements.carried_errors(
-        values, rule.to_legendre, rule.to_next, last, particular, noise,
-        random_signs(len(values), len(problem.start), 2), mesh.steps, LEVEL, END, CHANCE**2, _SAME,
+        values, rule.to_legendre, rule.to_next, last, particular, of_all,
+        random_signs(len(values), n, 2), LEVEL, END, most,
     )
     if problem.uncertain is not None:
         of_start = np.zeros((len(values), 1, *last.shape[1:]))
