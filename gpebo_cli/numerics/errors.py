@@ -5,9 +5,9 @@ of. Whether these errors help or harm each other nobody knows, so they are added
 several times over: the root mean square at an edge estimates (Σ_j ‖Φ_j l_j‖²)^½, where Φ_j leads
 from element j to the edge. What is left out, and rounding where the matrices are constant, may be
 wrong in the same direction each time: (Σ_j |Φ_j l_j|)² ≤ k Σ_j |Φ_j l_j|² (Cauchy, Schwarz) bounds
-every choice of signs at the k-th edge. So errors decay where the system forgets, grow where it
-grows and add up where it swings. Absolute values of the maps were rejected: a rotation would grow.
-Signs all equal were rejected: a rotation cancels them.
+every choice of signs at the k-th edge. Rounding of times never is. So errors decay where the system
+forgets, grow where it grows and add up where it swings. Absolute values of the maps were rejected:
+a rotation would grow. Signs all equal were rejected: a rotation cancels them.
 """
 
 from __future__ import annotations
