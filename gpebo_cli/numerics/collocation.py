@@ -310,9 +310,9 @@ def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
     found, moved = np.maximum(high, -low), np.abs(t[:, -1, None, None]) * (high - low)
     of_time = moved[..., n:]
     if c.constraints is not None:
-        p = at_points(c.constraints.offset, k, s)
-        swing = p.max(axis=1) - p.min(axis=1)
-        of_time = of_time + found[..., :n] @ (np.abs(t[:, -1, None, None]) * swing)
+        forcing = at_points(c.A @ c.constraints.offset, k, s)
+        swing = forcing.max(axis=1) - forcing.min(axis=1)
+        of_time = of_time + np.abs(t[:, -1, None, None]) * swing
     found = h[:, None, None] * (found if c.terms is None else np.maximum(found, c.terms))
     found[..., :n] += moved[..., :n]
     found = np.concatenate([found, of_time], axis=2)
