@@ -78,11 +78,7 @@ class LsDrem(ResumableEstimator):
         return super().axes()
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
-        """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case.
-
-        Without an f₀ rounding decides where 𝐘/Δ is nothing else: η̂ is what it is made of later, and
-        its errors are unknown.
-        """
+        """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
         part = self.least_squares
 
         def at(
@@ -95,12 +91,7 @@ class LsDrem(ResumableEstimator):
                 gain = gain * one_over_memory(t, case["beta"], info.began)[:, None]
             adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
             rates = np.broadcast_to(rate[:, None], weights.shape)
-            unknown = np.zeros(len(t), dtype=bool) if s.units is None else s.digits <= SINGULAR
-            delta[unknown] = 0.0
-            found = scalar_errors(rates, into, delta, adjugate, gain)
-            if not unknown.any():
-                return found
-            return found._replace(C=np.where(unknown[:, None, None], np.nan, found.C))
+            return scalar_errors(rates, into, delta, adjugate, gain)
 
         pairs = zip(part.cases, part.informations(regression, known), strict=True)
         gains = self.gains("gamma", regression.parameters)
