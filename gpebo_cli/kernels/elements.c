@@ -300,7 +300,8 @@ static Outcome carried_errors(Call *call)
                 const double one = error[(e / c * 2 * S + s) * c + e % c];
                 sum[s / S] += one * one;
             }
-            const double factor = (double)(k + 2), other = factor < most_factor ? factor : most_factor;
+            const double factor = (double)(k + 2),
+                         other = factor < most_factor ? factor : most_factor;
             const double found = sqrt(sum[0] * (factor / S)) + sqrt(sum[1] * (other / S));
             call->out[0][k * C + e] = found;
             most[e] = larger(most[e], found);
