@@ -572,7 +572,7 @@ def test_deviations_behind_the_start_do_not_depend_on_the_elements(name, monkeyp
     assert np.nanmax(np.abs(np.log(usual / early()))) > 0.02
 
 
-@pytest.mark.parametrize(("name", "first"), [("battery", 2.9), ("descriptor", 0.23)])
+@pytest.mark.parametrize(("name", "first"), [("battery", 2.0), ("descriptor", 0.18)])
 def test_there_are_no_deviations_while_rounding_decides_what_is_estimated(name, first):
     """Then η̂ of ls_drem is what the first data make of it that tell enough, which come later."""
     t = np.sort(np.concatenate([np.linspace(0.02, 0.1, 3), first * np.linspace(1.0, 2.0, 4)]))

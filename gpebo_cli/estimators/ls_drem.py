@@ -39,7 +39,7 @@ _AT_ONCE = 4096  # elements
 _NO_TIME = 1e-300  # seconds, at the start
 # A law of the rate 50/t forgets what rounding made of the first data that tell anything. It is
 # followed from the first of these times on, and known from the second one on, in times they took.
-_WITHOUT, _FORGOTTEN = 1.7, 2.0
+_WITHOUT, _FORGOTTEN = 1.25, 1.5
 _F0 = 1e-4  # beside a γ that is given
 
 
