@@ -34,7 +34,7 @@ from gpebo_cli.regression.resets import ExtensionState, level_of
 
 _PICARD_ROUNDS = 200
 _FORGOTTEN = 1e-200  # z that makes no difference to anything any more
-_LOOKED = np.geomspace(1e-6, 1.0, 128)  # of the time: there the first data that tell are sought
+_LOOKED = np.geomspace(1e-4, 1.0, 86)  # of the time: there the first data that tell are sought
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding

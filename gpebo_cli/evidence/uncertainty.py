@@ -117,7 +117,7 @@ def _propagated(
         element, places = sampler.element, sampler.weights
         before, group = factors[element], _group_of(part, groups.starts)[element]
         here = Sampler(element, places[:, 1:])(maps)
-        here[:, :, :size] += places[:, 0, None, None] * np.eye(size)
+        np.einsum("mii->mi", here[:, :, :size])[...] += places[:, :1]
         reached = here @ before  # of [ζ; s] (M, size, ·)
         inside = part.inside[element, 1]
         o = chain.observer(t[chosen], inside)
@@ -135,12 +135,17 @@ def _propagated(
         )
         x = gain[chosen] @ eta
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
-        of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
+        of_eta[chosen], of_x[chosen] = _sizes(eta), _sizes(x)
     if chain.unknown:  # one row alone says nothing of that, but rounding does
         row = groups.after[0] - groups.starts[0]
         for each in (of_eta, of_x):
             each[t < groups.after[0] + _SNAP * row] = np.nan
     return of_eta, of_x
+
+
+def _sizes(rows: Array) -> Array:
+    """Of each row of matrices (M, k, ·): (M, k)."""
+    return np.asarray(np.sqrt(np.einsum("mki,mki->mk", rows, rows)))
 
 
 class _Chain:
@@ -218,7 +223,7 @@ class _Chain:
             poor &= left < until[np.searchsorted(begun, left, side="right").clip(1) - 1]
             if poor.any():
                 tail = _tails(mesh, maps, factors, end, self.zeta)
-                poor &= tail > _TOLERANCE
+                poor &= tail > _TOLERANCE * 10.0**cuts
             if not poor.any():
                 self._L, self._group = end, int(group[-1])
                 return mesh, maps, factors, (common, varies)
@@ -247,13 +252,13 @@ def _tails(mesh: Mesh, maps: Array, factors: Array, end: Array, zeta: int) -> Ar
     size, legendre = maps.shape[2], mesh.rule.to_legendre[-1]
     last = np.einsum("s,ksij->kij", legendre[1:], maps)
     last[:, :, :size] += legendre[0] * np.eye(size)
-    sizes = np.linalg.norm(np.concatenate([factors, end[None]]), axis=2)
+    sizes = _sizes(np.concatenate([factors, end[None]]))
     rest = np.delete(sizes, np.s_[zeta:size], axis=1).max(initial=0.0)
     scale = np.maximum(sizes[1:, :size], sizes[:-1, :size])
     least = scale.max(axis=0, initial=0.0)
     least[:zeta] = rest
     scale = np.maximum(scale, _NOTHING * least + np.finfo(float).tiny)
-    return np.asarray((np.linalg.norm(last @ factors, axis=2) / scale).max(axis=1, initial=0.0))
+    return np.asarray((_sizes(last @ factors) / scale).max(axis=1, initial=0.0))
 
 
 def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None) -> Array:
@@ -396,12 +401,13 @@ def _layered(mesh: Mesh, instants: Array, rate: float, t: Array) -> Mesh:
     The end of an element beyond the layer is accurate, but no polynomial goes through both of its
     ends. Only elements in which there are times of the output t (M,) are cut.
     """
+    if rate * mesh.steps.max(initial=0.0) <= 1.0:
+        return mesh
     begins, sampler = np.diff(_group_of(mesh, instants), prepend=-1) > 0, mesh.sampler(t)
     between = np.count_nonzero(sampler.weights, axis=1) > 1  # and not at a node
     begins &= np.bincount(sampler.element[between], minlength=mesh.size) > 0
     h, left = mesh.steps[begins], mesh.edges[:-1][begins]
-    fast = rate * h.max(initial=0.0)
-    cuts = int(np.ceil(np.log(max(fast, 1.0)) / np.log(_LONGER)))
+    cuts = int(np.ceil(np.log(max(rate * h.max(initial=0.0), 1.0)) / np.log(_LONGER)))
     parts = h * _LONGER ** -np.arange(1.0, 1.0 + cuts)[:, None]
     useful = (rate * parts * _LONGER > 1.0) & (parts > _SHORTEST * np.abs(mesh.edges).max())
     return Mesh(np.union1d(mesh.edges, (left + parts)[useful]), mesh.rule)
@@ -501,11 +507,11 @@ def _factors(
     L = np.zeros((whole, whole)) if L is None else L
     used = L.shape[1]
     L = np.pad(L, ((0, 0), (0, width - used)))
-    out = np.empty((len(ends), *L.shape))
+    out, kept = np.empty((len(ends), *L.shape)), np.where(anew, 0, alive - fresh).tolist()
     for k, end in enumerate(ends):
         if k in turns:
             L[:size] = turns[k] @ L[:size]
-        for block in range(0 if anew[k] else alive - fresh[k], alive):
+        for block in range(kept[k], alive):
             if used == width:
                 L[:, :whole] = np.asarray(np.linalg.qr(L.T, mode="r")).T
                 L[:, whole:] = 0.0
