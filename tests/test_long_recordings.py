@@ -13,7 +13,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
 from gpebo_cli.evidence.groups import grouped
-from gpebo_cli.experiment.fit import _varies_slowly
+from gpebo_cli.experiment.fit import _follows, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
@@ -262,6 +262,30 @@ def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
     assert np.mean([_varies_slowly(e) for e in white]) < 0.04
     for misfit in (wave, 0.13):
         assert np.mean([_varies_slowly(e + misfit) for e in white]) > 0.9
+
+
+def test_what_follows_an_input_far_below_the_noise_is_told_and_white_noise_does_not():
+    rng = np.random.default_rng(0)
+    white = rng.standard_normal((300, 10_000, 2))
+    fast = np.sin(0.4 * np.arange(10_000))
+    inputs = np.stack([fast, np.ones(10_000), rng.standard_normal(10_000)], axis=1)
+    late = 0.1 * np.roll(fast, 7)[:, None]
+    assert np.mean([_follows(e, inputs) for e in white]) < 0.03
+    assert np.mean([_follows(e + late, inputs) for e in white]) > 0.9
+    assert np.mean([_varies_slowly(e + late) for e in white]) < 0.1
+    assert not _follows(white[0] + late, inputs[:, 1:2])
+    assert not _follows(white[0] + late, inputs[:, :0])
+
+
+def test_a_rate_that_is_five_percent_off_follows_the_input():
+    right, wrong = (one_state(A=[[a]], B=[[1]], inputs={"u": "sin(3*t)"}) for a in (-1.0, -1.05))
+    made = run(right, observer="none", time={"samples": 2001})
+    noise = 0.02 * np.random.default_rng(1).standard_normal(2001)
+    data = {"t": made.t, **made.inputs, "y": made["y"] + noise}
+    assert run(right, data=data, estimator="least_squares").details.fit.white
+    said = run(wrong, data=data, estimator="least_squares").verdict
+    assert "is not white (its correlation is" in said
+    assert "it follows the inputs), which suggests" in said
 
 
 def test_what_a_sensor_shows_too_much_at_all_times_is_told():

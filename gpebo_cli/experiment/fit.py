@@ -13,6 +13,8 @@ from gpebo_cli.observers import Observation
 
 _LAGS = 20  # of the residual's autocorrelation
 _SLOW = 8  # one in so many of a residual's cosines is slow
+_AT_MOST = 1 << 12  # means of samples that are compared with inputs,
+_FAINT = 1e-3  # of whose past smaller directions than that are their own noise
 _RARE = 0.005  # chance of each sum below which they are not those of white noise
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
@@ -63,6 +65,32 @@ def _varies_slowly(residual: Array) -> bool:
     sums = (spectrum / spectrum[slow:].mean(axis=0)).sum(axis=1).cumsum()[some - 1]
     chances = fdtrc(some * outputs, (count - slow) * outputs, sums / (some * outputs))
     return bool(chances.min(initial=1.0) < _RARE)
+
+
+def _follows(residual: Array, inputs: Array) -> bool:
+    """Whether a residual (N, r) follows inputs (N, m), those of now or of up to N/8 samples ago.
+
+    White noise is independent of them, and what a wrong plant leaves is not.
+    """
+    from scipy.special import fdtrc
+
+    each = -(-len(residual) // _AT_MOST)
+    count = len(residual) // each
+    r, u = (x[: count * each].reshape(count, each, x.shape[1]).mean(axis=1)
+            for x in (residual, inputs))
+    ago = np.append(0, 2 ** np.arange((len(r) // 8).bit_length()))
+    past = np.hstack([u[ago[-1] - k : len(u) - k] for k in ago])
+    r, moving = r[ago[-1] :] - r[ago[-1] :].mean(axis=0), past - past.mean(axis=0)
+    size, whole = (np.linalg.norm(x, axis=0) for x in (moving, past))
+    some = size > _SILENT * whole
+    basis, sizes, _ = np.linalg.svd(moving[:, some] / size[some], full_matrices=False)
+    basis = basis[:, sizes > _FAINT * sizes.max(initial=0.0)]
+    count, free = basis.shape[1], len(r) - basis.shape[1] - 1
+    if not count or free < count:
+        return False
+    along, all_of_it = ((basis.T @ r) ** 2).sum(axis=0), (r**2).sum(axis=0)
+    ratio = (along / (all_of_it - along)).mean() * free / count
+    return bool(fdtrc(count * r.shape[1], free * r.shape[1], ratio) < _RARE)
 
 
 def _step(y: Array) -> float:
@@ -135,6 +163,7 @@ def _explained(
             ) if own < _ROUNDING * step
         ],
         correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
+        follows=_follows(residual[:, seen], u[::stride]),
         in_matrices=tuple(
             name for name in system.outputs if name in names and observation.errors is None
         ),

@@ -173,6 +173,7 @@ class Fit:
     outputs: Array | None = None  # (N, r) ŷ of the best case at the times of the signals
     correlation: Array | None = None  # (lags,) of its residual at the samples, from lag 1 on
     slow: bool = False  # whether more of it than of white noise varies slowly
+    follows: bool = False  # whether it depends on the inputs, which noise does not
     lag: float = np.nan  # seconds
     band: float = np.nan  # 95 % of the correlations of white noise are within
     far: Sequence[tuple[str, int, float]] = ()  # outputs, samples far from most, time of the first
@@ -186,7 +187,7 @@ class Fit:
         if self.correlation is None:
             return None
         outside = np.abs(self.correlation) > self.band
-        return bool(outside.mean() <= _OUTSIDE) and not self.slow
+        return bool(outside.mean() <= _OUTSIDE) and not (self.slow or self.follows)
 
     @property
     def best(self) -> int:

@@ -114,7 +114,8 @@ def _explains(fit: Fit, case: int) -> str:
         why = f"that it is rounding ({steps}), for which deviations are too small, or {why}"
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
-        f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}), which "
+        f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}"
+        f"{', and it follows the inputs' * fit.follows}), which "
         f"{f'noise of {names} in the matrices does ({_TAKEN_OUT}); or it ' if names else ''}"
         f"suggests {why}"
     )
