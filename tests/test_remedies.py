@@ -573,10 +573,9 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
         psi = np.array([1.0 + 0.0 * t, np.sin(3.0 * t)])
         return A, np.array([np.sin(t), np.cos(t)]), psi[:, None] * np.array([*psi, np.cos(t)])
 
-    A, b, outer = (
-        Trajectory(mesh, np.moveaxis(x, (-2, -1), (0, 1))) for x in signals(mesh.points)
-    )
-    moves = Dynamics(A, b, np.array([1.0, 4.0]))
+    A, b, outer = (np.moveaxis(x, (-2, -1), (0, 1)) for x in signals(mesh.points))
+    rows = Trajectory(mesh, np.concatenate([A, b[..., None]], axis=3))
+    moves, outer = Dynamics(rows, np.array([1.0, 4.0])), Trajectory(mesh, outer)
     times, levels = moves.forgetting
 
     def slope(t, X, rho):
@@ -588,5 +587,6 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
     for start, stop, rho in zip([0.0, *times], [*times, 4.0], levels, strict=True):
         solved = solve_ivp(slope, (start, stop), X, "DOP853", args=(rho,), rtol=1e-12, atol=1e-12)
         X = solved.y[:, -1]
-    found = filtered(outer, rates, gains, moves, np.arange(6.0).reshape(2, 3)).final
+    begin = ExtensionState(np.arange(6.0).reshape(2, 3), 0.0)
+    found = filtered(outer, rates, gains, moves, [begin]).final
     np.testing.assert_allclose(found.ravel(), X, rtol=1e-9)

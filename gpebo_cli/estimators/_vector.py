@@ -17,7 +17,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.estimator import WindowEstimates
+from gpebo_cli.regression.estimator import Lasting, WindowEstimates
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.resets import ExtensionState
 
@@ -81,8 +81,7 @@ class VectorLaw:
             M, N, b = np.split(packed(t, inside), [first, first + p], axis=2)
             A, f = np.zeros((len(t), p + k, p + k)), np.zeros((len(t), p + k, c))
             if self.dynamics is not None:
-                A[:, :p, :p] = self.dynamics.A(t, inside)
-                f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
+                A[:, :p, :p], f[:, :p, 0] = self.dynamics.at(t, inside)
             if residual:
                 A[:, :p, p:] = gains[:, None] * np.swapaxes(M, 1, 2)
                 A[:, p:, :p], A[:, p:, p:], f[:, p:] = -N, -np.eye(k), b
@@ -123,7 +122,7 @@ def _with_residual(signals: Array, eta: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class VectorEstimates:
+class VectorEstimates(Lasting):
     """Estimates of a vector law, one integration per case when it is asked for."""
 
     law: VectorLaw
@@ -142,7 +141,9 @@ class VectorEstimates:
         return self.told or self.over([self], self.information.mesh.span)
 
     def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
-        """Persistent excitation by the information of all ``parts`` of a span."""
+        """Persistent excitation by the information of all ``parts`` of a span, or what is told."""
+        if self.told is not None:
+            return super().over(parts, span)
         each = (part.information for part in parts if isinstance(part, VectorEstimates))
         return persistent(self.information, float(self.gains.min()), each, span)
 

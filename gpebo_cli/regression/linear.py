@@ -14,9 +14,9 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered
+from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered, state_of
 from gpebo_cli.regression.parametrisation import Parametrisation
-from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
+from gpebo_cli.regression.resets import ExtensionState, Known, Reset, level_of
 
 _MANY = 16  # parameters, from which on G at the end is made without those at all other points
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
@@ -93,8 +93,7 @@ class LinearRegression:
         known.
         """
         if self.dynamics is not None:
-            ones = np.ones(self.p)
-            return filtered(self.outer, 0.0 * ones, ones, self.dynamics)
+            return self._moving(self.dynamics, ())
         if not self.resets:
             held = self.p < _MANY or "outer" in vars(self)
             return (self if held else replace(self)).outer.integral()
@@ -110,13 +109,23 @@ class LinearRegression:
 
     def gram_parts(self) -> Iterator[Trajectory]:
         """[G | h] one window after the other, so that little of it is held."""
-        known: Array | float = 0.0
+        known, state = np.zeros((self.p, 1)), list[ExtensionState]()
         for window in self.windows():
+            if window.whole is not None and window.dynamics is not None:
+                part = window._moving(window.dynamics, state)  # noqa: SLF001
+                state = [state_of(part, state)]
+                yield part
+                continue
             part = window.gram
             if window is not self:  # what it holds is its own
                 np.add(part.values, known, out=part.values)
                 known = part.final
             yield part
+
+    def _moving(self, dynamics: Dynamics, known: Known) -> Trajectory:
+        """[G | h] of parameters that move, from what was ``known`` before."""
+        ones = np.ones(self.p)
+        return filtered(self.outer, 0.0 * ones, ones, dynamics, known)
 
     @cached_property
     def gram_final(self) -> Array:
@@ -226,7 +235,7 @@ class LinearRegression:
     @property
     def long(self) -> bool:
         """Whether there are several windows."""
-        plain = not (self.resets or self.dynamics or self.realisations)
+        plain = not (self.resets or self.realisations)
         return plain and self.mesh.size > _WINDOW
 
     @property

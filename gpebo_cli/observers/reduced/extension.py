@@ -16,7 +16,7 @@ from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Kind, Mesh, Samples, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import largest_entry, log_norm
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMatrices, weakest
@@ -219,9 +219,8 @@ def joined(parts: Iterable[Extension]) -> Extension:
     mesh = Mesh(over_time.pop("edges"), part.mesh.rule)
     z, scale, asked = over_time.pop("z"), over_time.pop("scale"), over_time.pop("asked", None)
     return Extension(
-        Trajectory(mesh, z) if asked is None else mesh.sampled(
-            np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]])
-        ), max(errors),
+        mesh.sampled(np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]]))
+        if isinstance(part.trajectory, Samples) else Trajectory(mesh, z), max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
