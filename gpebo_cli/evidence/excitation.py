@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -103,16 +103,24 @@ def assess(
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     window = settings.window if settings.window is not None else horizon / WINDOWS
     # What is looked at later must not keep what is known of this regression by now.
-    later = replace(regression)
+    later, moving = replace(regression), regression.dynamics is not None
+    # Of parameters that move one pass of filters serves all of the times.
+    first = regression.gram_with_rounding(t) if moving else None
+    seen = cache(lambda: first or later.gram_with_rounding(t))
+    end = (
+        (first[0][-1:], np.zeros((1, regression.p))) if first
+        else regression.gram_with_rounding(t[-1:])
+    )
 
-    def eigenvalues(at: Array) -> Array:
-        return np.maximum(symmetric_eigenvalues(later.gram_at(at)), 0.0)
+    def eigenvalues(gram: Array) -> Array:
+        return np.maximum(symmetric_eigenvalues(gram), 0.0)
 
     return Excitation(
-        t, window, settings.rho, regression.parameters, known_at(regression, t[-1:], tol),
+        t, window, settings.rho, regression.parameters, _known(regression, t[-1:], tol, end),
         t_c=partial(_t_c, later, settings.rho, tol),
-        lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
-        known=partial(known_at, later, t, tol), gram_eigenvalues=partial(eigenvalues, t),
+        lambda_min=lambda: float(eigenvalues(end[0])[0, 0]) if later.p else 0.0,
+        known=lambda: _known(later, t, tol, seen()),
+        gram_eigenvalues=lambda: eigenvalues(seen()[0]),
         pe_level=lambda: window_level(
             ((part.outer for part in segment.windows()) for segment in later.segments), t, window,
             later.resets,
@@ -122,7 +130,14 @@ def assess(
 
 def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
-    gram, rounding = regression.gram_with_rounding(at)
+    return _known(regression, at, tol, regression.gram_with_rounding(at))
+
+
+def _known(
+    regression: LinearRegression, at: Array, tol: float, seen: tuple[Array, Array]
+) -> Knowledge:
+    """:func:`known_at` from [G | h] with its rounding there."""
+    gram, rounding = seen
     rounding = rounding + regression.rounding_of(gram)
     return knowledge(gram, *_beside(regression, at), tol, rounding)
 

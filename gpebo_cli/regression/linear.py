@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from math import prod
 
 import numpy as np
 
@@ -108,19 +110,31 @@ class LinearRegression:
         return Trajectory(self.mesh, np.concatenate(pieces))
 
     def gram_parts(self) -> Iterator[Trajectory]:
-        """[G | h] one window after the other, so that little of it is held."""
+        """[G | h] one window after the other, so that little of it is held.
+
+        Who comes to the end has found ``gram_final`` (SolverError: squares are too large for
+        numbers).
+        """
         known, state = np.zeros((self.p, 1)), list[ExtensionState]()
         for window in self.windows():
-            if window.whole is not None and window.dynamics is not None:
+            if window is self:
+                part = self.gram
+            elif window.dynamics is not None:
                 part = window._moving(window.dynamics, state)  # noqa: SLF001
                 state = [state_of(part, state)]
-                yield part
-                continue
-            part = window.gram
-            if window is not self:  # what it holds is its own
+            else:
+                part = window.gram  # what it holds is its own
                 np.add(part.values, known, out=part.values)
                 known = part.final
+            finite = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
+            if not finite.all():
+                t = part.mesh.edges[np.argmin(finite)]
+                raise SolverError(
+                    f"∫ψᵀψ is too large for a number near t = {t:.4g}; write Y and ψ in larger "
+                    "units"
+                )
             yield part
+        vars(self).setdefault("gram_final", part.final)
 
     def _moving(self, dynamics: Dynamics, known: Known) -> Trajectory:
         """[G | h] of parameters that move, from what was ``known`` before."""
@@ -129,19 +143,11 @@ class LinearRegression:
 
     @cached_property
     def gram_final(self) -> Array:
-        """[G | h] at the end, (p, p + c) (SolverError: squares are too large for numbers)."""
+        """[G | h] at the end, (p, p + c) (SolverError: as of :meth:`gram_parts`)."""
         if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
             rows = (window._weighted() for window in self.windows())  # noqa: SLF001
             return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
-        for part in self.gram_parts():
-            known = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
-            if not known.all():
-                t = part.mesh.edges[np.argmin(known)]
-                raise SolverError(
-                    f"∫ψᵀψ is too large for a number near t = {t:.4g}; write Y and ψ in larger "
-                    "units"
-                )
-        return part.final
+        return deque(self.gram_parts(), maxlen=1)[0].final
 
     def gram_at(self, t: Array) -> Array:
         """[G | h] at the times t (M,), (M, p, p + c)."""
@@ -156,7 +162,8 @@ class LinearRegression:
         start, stop = self.mesh.span
         if (t == stop).all():
             return np.repeat(self.gram_final[None], len(t), axis=0), np.zeros((len(t), self.p))
-        found, rounding = np.empty((len(t), *self.gram_final.shape)), np.empty((len(t), self.p))
+        columns = self.p + prod(self.realisations)
+        found, rounding = np.empty((len(t), self.p, columns)), np.empty((len(t), self.p))
         for part in self.gram_parts():
             mesh, (first, last) = part.mesh, part.mesh.span
             some = ((t >= first) | (first == start)) & ((t < last) | (last == stop))
