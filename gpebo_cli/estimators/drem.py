@@ -51,8 +51,8 @@ def follow(
     values = extended.values
     delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
     mesh = extended.mesh
-    diagonal = Trajectory(mesh, delta[..., None, None] * np.eye(values.shape[2]))
-    law = VectorLaw(diagonal, diagonal, Trajectory(mesh, Y[..., 0]), dynamics=dynamics)
+    same = Trajectory(mesh, np.broadcast_to(delta[..., None, None], Y.shape))
+    law = VectorLaw(None, same, Trajectory(mesh, Y[..., 0]), dynamics=dynamics, mixed=True)
     mixed = Trajectory(mesh, delta)
     energy = sum(each.energy for each in known) + float(Trajectory(mesh, delta**2).integral().final)
     requirement = energy_requirement(
@@ -61,7 +61,7 @@ def follow(
     )
     state = replace(state_of(extended, known), energy=energy)
     return VectorEstimates(
-        law, start, gains, t, diagonal, requirement, reached=(state,), mixed=mixed
+        law, start, gains, t, same, requirement, reached=(state,), mixed=mixed
     )
 
 
