@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain, islice, zip_longest
 
 import numpy as np
@@ -75,7 +75,7 @@ def estimate(
         found = in_windows(estimator, regression, t, t if shown is None else shown)
         if found is None and regression.dynamics is not None:
             moving = able(estimator, Moving, _FOLLOW)
-            return moving.estimate_moving(regression, regression.dynamics, t, ())
+            return moving.estimate_moving(regression, t, (), regression.dynamics)
         return estimator.estimate(regression, t) if found is None else found
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
@@ -104,13 +104,10 @@ def in_windows(
         return None
     if len(estimator.cases) * t.size * regression.p > _MOST:
         return None
-    go_on = estimator.go_on
+    go_on: Callable[[LinearRegression, Array, Known], WindowEstimates] = estimator.go_on
     if regression.dynamics is not None:
-        moving, dynamics = able(estimator, Moving, _FOLLOW), regression.dynamics
-
-        def go_on(window: LinearRegression, t: Array, known: Known) -> WindowEstimates:
-            return moving.estimate_moving(window, dynamics, t, known)
-
+        moving = able(estimator, Moving, _FOLLOW)
+        go_on = partial(moving.estimate_moving, dynamics=regression.dynamics)
     etas: list[Array] = []
     deltas: list[Array | None] = []
 

@@ -26,7 +26,7 @@ class Drem(FilteredEstimator):
     """
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array, known: Known
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) at the times t (M,).
 

@@ -123,7 +123,7 @@ class LeastSquares(ResumableEstimator):
         return RecursiveLeastSquares(self, parameters)
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array, known: Known
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> Found:
         """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), at the times t (M,).
 

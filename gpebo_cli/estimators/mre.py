@@ -72,7 +72,7 @@ class MemoryExtension(ResumableEstimator):
         return tuple(partial(at, np.broadcast_to(gain, p)[:, None]) for gain in gains)
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array, known: Known
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + Γ(𝒴 − Ω η̂) at the times t (M,)."""
         rates = self._rates(regression.p)

@@ -105,8 +105,8 @@ def resolve(
     """Resolve signals that are known: nothing is integrated.
 
     ``evaluate`` gives what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind
-    with its floor (see :func:`unresolved_kinds`), perhaps of elements before these; the rest is as of :func:`refine`. The result is
-    the mesh, what is wanted on it, and the largest tail.
+    with its floor (see :func:`unresolved_kinds`), perhaps with elements in front; the rest is as of
+    :func:`refine`. The result is the mesh, what is wanted on it, and the largest tail.
     """
 
     def on(mesh: Mesh, before: Found | None, kept: IntArray) -> tuple[Found, Array]:  # noqa: ARG001

@@ -140,7 +140,7 @@ class Moving(Protocol):
     """An estimator that can follow parameters that move."""
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array, known: Known
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> WindowEstimates:
         """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending.
 
