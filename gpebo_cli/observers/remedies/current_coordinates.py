@@ -69,6 +69,7 @@ class CurrentCoordinates:
         # [ξ_a | ξ_b | Φ] = [0 | 0 | −I] is the identity map from ζ to w.
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
+        reduced.signals.check_memory(system, more=k * (p + 1))
         units = np.concatenate([reduced.form.units.unknowns, reduced.units])
         start = reduced.first.at_first
         size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
