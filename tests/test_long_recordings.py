@@ -102,7 +102,9 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
 
 @pytest.mark.parametrize(("observer", "estimator"), [
     ("kalman_bucy", "ls_drem"),
-    ({"name": "gpebo", "remedy": "current_coordinates"}, "drem"),
+    *(({"name": "gpebo", "remedy": "current_coordinates"}, e) for e in (
+        "drem", "mre", "gradient", "least_squares", {"name": "least_squares", "f0": [0.1, 1.0]},
+    )),
     ("gpebo", {"name": "fct", "mu": [0.1, 0.3]}),  # side by side
 ])
 def test_a_long_filter_runs_window_by_window(observer, estimator, monkeypatch):
@@ -117,7 +119,10 @@ def test_a_long_filter_runs_window_by_window(observer, estimator, monkeypatch):
         made = run(
             "descriptor", data=data, observer=observer, estimator=estimator, time={"samples": 31}
         ).details.estimation
-        found.append([made.parameters, made.states, made.parameters_std, made.states_std])
+        reached = made.requirement.evidence.values() if observer != "kalman_bucy" else ()
+        found.append(
+            [made.parameters, made.states, made.parameters_std, made.states_std, *reached]
+        )
     for windows, whole in zip(found[1], found[0], strict=True):
         if whole is not None:
             np.testing.assert_allclose(windows, whole, rtol=1e-8, atol=1e-11)
