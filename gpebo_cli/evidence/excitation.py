@@ -6,7 +6,7 @@ Interval excitation, as the paper's Assumption 2 means it, is G(t_c) = ∫ψᵀ�
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -105,7 +105,15 @@ def assess(
     # What is looked at later must not keep what is known of this regression by now.
     later, moving = replace(regression), regression.dynamics is not None
     # Of parameters that move one pass of filters serves all of the times.
-    first = regression.gram_with_rounding(t) if moving else None
+    ends = list[tuple[Array, Array]]()
+
+    def parts() -> Iterator[Trajectory]:
+        for part in regression.gram_parts():
+            at = part.mesh.edges[1:], part.values[:, -1]
+            ends.append(_told(regression, settings.rho, tol, *at))
+            yield part
+
+    first = regression.gram_with_rounding(t, parts()) if moving else None
     seen = cache(lambda: first or later.gram_with_rounding(t))
     end = (
         (first[0][-1:], np.zeros((1, regression.p))) if first
@@ -117,7 +125,7 @@ def assess(
 
     return Excitation(
         t, window, settings.rho, regression.parameters, _known(regression, t[-1:], tol, end),
-        t_c=partial(_t_c, later, settings.rho, tol),
+        t_c=partial(_t_c, later, settings.rho, tol, ends),
         lambda_min=lambda: float(eigenvalues(end[0])[0, 0]) if later.p else 0.0,
         known=lambda: _known(later, t, tol, seen()),
         gram_eigenvalues=lambda: eigenvalues(seen()[0]),
@@ -147,20 +155,29 @@ def _beside(regression: LinearRegression, at: Array) -> tuple[Array, Array]:
     return regression.terms(at), at - regression.mesh.edges[0]
 
 
-def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
-    """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    def seen(at: Array, matrices: Array, rounding: Array) -> tuple[Array, Array]:
-        """How well all are told apart, or λ_min over ρ, and what of that may be rounding."""
-        rounding = rounding + regression.rounding_of(matrices)
-        if rho is not None:
-            level = rounding.max(axis=1, initial=_TINY)
-            return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
-        known = knowledge(matrices, *_beside(regression, at), tol, rounding)
-        return known.smallest, known.rounding
+def _told(
+    regression: LinearRegression, rho: float | None, tol: float, at: Array, matrices: Array,
+    rounding: Array | float = 0.0,
+) -> tuple[Array, Array]:
+    """How well all are told apart, or λ_min over ρ, and what of that may be rounding, (M,) each."""
+    rounding = rounding + regression.rounding_of(matrices)
+    if rho is not None:
+        level = rounding.max(axis=1, initial=_TINY)
+        return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
+    known = knowledge(matrices, *_beside(regression, at), tol, rounding)
+    return known.smallest, known.rounding
 
+
+def _t_c(
+    regression: LinearRegression, rho: float | None, tol: float, ends: list[tuple[Array, Array]],
+) -> float | None:
+    """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``.
+
+    What is :func:`_told` at the right ends of elements is in ``ends``, part by part, or nothing.
+    """
+    seen = partial(_told, regression, rho, tol)
     smallest, level = (np.concatenate(each) for each in zip(*(
-        seen(part.mesh.edges[1:], part.values[:, -1], np.zeros((part.mesh.size, regression.p)))
-        for part in regression.gram_parts()
+        ends or (seen(part.mesh.edges[1:], part.values[:, -1]) for part in regression.gram_parts())
     ), strict=True))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -153,18 +153,20 @@ class LinearRegression:
         """[G | h] at the times t (M,), (M, p, p + c)."""
         return self.gram_with_rounding(t)[0]
 
-    def gram_with_rounding(self, t: Array) -> tuple[Array, Array]:
+    def gram_with_rounding(
+        self, t: Array, parts: Iterable[Trajectory] | None = None
+    ) -> tuple[Array, Array]:
         """The same, and how wrong rounding may make the diagonal of G, (M, p).
 
         Early in an element, G is interpolated from what it grows to, and takes part in the rounding
-        of that.
+        of that. The ``parts`` are those of :meth:`gram_parts`, for who looks at them, too.
         """
         start, stop = self.mesh.span
-        if (t == stop).all():
+        if parts is None and (t == stop).all():
             return np.repeat(self.gram_final[None], len(t), axis=0), np.zeros((len(t), self.p))
         columns = self.p + prod(self.realisations)
         found, rounding = np.empty((len(t), self.p, columns)), np.empty((len(t), self.p))
-        for part in self.gram_parts():
+        for part in self.gram_parts() if parts is None else parts:
             mesh, (first, last) = part.mesh, part.mesh.span
             some = ((t >= first) | (first == start)) & ((t < last) | (last == stop))
             if some.any():
