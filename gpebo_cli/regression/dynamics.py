@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from math import gamma, pi, sqrt
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from gpebo_cli.numerics.collocation import merged, solve
 from gpebo_cli.numerics.linalg import largest_over_time, transpose
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, joined, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.regression.resets import ExtensionState, Known
 
@@ -23,6 +25,7 @@ _MAX_ELEMENTS = 200_000
 _ADVICE = "use another observer.remedy, or a shorter time.horizon"
 _LEVELS, _BESIDE_TIES = 96, 0.1234  # of ρ, a decade; none of them is at a round number
 _SHORT = 0.01  # of a decay's own time
+_STAGES = 7  # up to which more of them are cheaper than more elements
 _GROWTH = 1e3  # within an element: as many digits are lost
 
 
@@ -110,6 +113,7 @@ def filtered(
     if known:
         start, sizes = own * known[0].values, own * known[0].level
     pieces, (times, levels) = list[Trajectory](), dynamics.forgetting
+    rule = _rule(outer.mesh, float(rates.max() + levels[-1]))
 
     def moving(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         """Λ + ρI + 𝔸ᵀ and 𝔸 (N, p, p), and 𝕓 (N, p)."""
@@ -119,7 +123,7 @@ def filtered(
 
     for window in outer.mesh.windows():
         within = times[(times > window.span[0]) & (times < window.span[1])]
-        finer = Mesh(with_others(window.edges, within), window.rule)
+        finer = Mesh(with_others(window.edges, within), rule)
         arguments = finer, outer, gains, moving, start, sizes
         pieces.append(_carried(*arguments) or _over(*arguments))
         start = pieces[-1].final
@@ -128,8 +132,19 @@ def filtered(
     return Trajectory(found.mesh, found.values / own)
 
 
+def _rule(mesh: Mesh, rate: float) -> RadauRule:
+    """That of a mesh, or one of more stages, which e^{−rate t} needs in the usual element.
+
+    Its Legendre coefficients are √π xⁿ/Γ(n + ½), x = rate h/4. Cuts would make more points.
+    """
+    x, stages = 0.25 * rate * float(np.median(mesh.steps)), mesh.rule.stages
+    while stages < _STAGES and sqrt(pi) * x ** (stages + 1) > TOLERANCE * gamma(stages + 1.5):
+        stages += 1
+    return radau_rule(stages)
+
+
 def state_of(extended: Trajectory, known: Known) -> ExtensionState:
-    """From what :func:`filtered` goes on after it has made this of what was ``known``."""
+    """From what :func:`filtered` goes on after [Ω | 𝒴] (p, p + 1), made of what was ``known``."""
     sizes = largest_over_time(extended.values, 2)
     return ExtensionState(extended.final, np.maximum(sizes, known[0].level) if known else sizes)
 
