@@ -12,7 +12,7 @@ import yaml
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import experiment, left_of_identities, shipped
+from plants import experiment, left_of_identities, one_state, shipped
 from plants import observed as along
 from processes import assert_refused, refused
 from regressions import ETA, three
@@ -472,6 +472,16 @@ def test_filters_forget_as_fast_as_the_plant_and_not_as_w_is_held_on_constraints
     ), plant_from_mapping(arm))
     assert relative_error(result)[20:].max() < 0.03
     assert result.estimation.parameters[0, -1, 0] == pytest.approx(0.7, abs=0.01)
+
+
+@pytest.mark.parametrize("more", [
+    {"phi": ["sin(t)"]}, {"unknowns": {"a": 2.0}, "F": [["sin(t)"]]},
+])
+def test_states_without_derivatives_leave_nothing_that_moves(more):
+    """ζ = θ, or nothing at all."""
+    plant = one_state(E=[[0]], A=[[-1]], initial_state=[0], **more)
+    result = run(plant, 5.0, estimator={"name": "drem"}, remedy="current_coordinates")
+    assert relative_error(result)[100:].max() < 1e-6
 
 
 class Outsider:

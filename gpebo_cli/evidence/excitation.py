@@ -103,9 +103,7 @@ def assess(
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     window = settings.window if settings.window is not None else horizon / WINDOWS
     # What is looked at later must not keep what is known of this regression by now.
-    later, moving = replace(regression), regression.dynamics is not None
-    # Of parameters that move one pass of filters serves all of the times.
-    ends = list[tuple[Array, Array]]()
+    later, ends = replace(regression), list[tuple[Array, Array]]()
 
     def parts() -> Iterator[Trajectory]:
         for part in regression.gram_parts():
@@ -113,7 +111,8 @@ def assess(
             ends.append(_told(regression, settings.rho, tol, *at))
             yield part
 
-    first = regression.gram_with_rounding(t, parts()) if moving else None
+    # Of parameters that move one pass of filters serves all of the times.
+    first = regression.gram_with_rounding(t, parts()) if regression.dynamics else None
     seen = cache(lambda: first or later.gram_with_rounding(t))
     end = (
         (first[0][-1:], np.zeros((1, regression.p))) if first

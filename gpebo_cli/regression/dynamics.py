@@ -45,10 +45,10 @@ class Dynamics:
 
     @cached_property
     def growth(self) -> float:
-        """By which power of e parameters may grow, ∫ of the largest real part; 0: by none."""
+        """By which power of e parameters may grow, ∫ of the largest real part or 0."""
         mesh, values = self.rows.mesh, self.rows.values
-        rates = fastest(values.reshape(-1, *values.shape[2:]))[1]
-        return max(float(mesh.trajectory(rates).integral().final), 0.0)
+        rates = fastest(values.reshape(mesh.points.size, *values.shape[2:]))[1]
+        return float(mesh.trajectory(rates).integral().final)
 
     @cached_property
     def forgetting(self) -> tuple[Array, Array]:
@@ -67,7 +67,7 @@ class Dynamics:
             return np.where(some, level, -np.inf)
 
         t = mesh.points.ravel()
-        found = needed(t, values.reshape(-1, *values.shape[2:]))
+        found = needed(t, values.reshape(t.size, *values.shape[2:]))
         levels, times = [-np.inf], list[float]()
         for k in np.flatnonzero(np.diff(np.maximum.accumulate(found)) > 0.0):
             while levels[-1] < found[k + 1]:
@@ -82,7 +82,7 @@ class Dynamics:
 
 
 def fastest(rows: Array) -> tuple[Array, Array]:
-    """Rates of the fastest decay and of the fastest growth, (N,) each, of (N, k, p + 1).
+    """Rates of the fastest decay and growth, (N,) each, or 0, of the last rows (N, k, p + 1).
 
     They are found where a matrix differs from the one before it.
     """
@@ -90,7 +90,7 @@ def fastest(rows: Array) -> tuple[Array, Array]:
     fresh = np.append(True, (A[1:] != A[:-1]).any(axis=(1, 2)))
     real = np.linalg.eigvals(A[fresh]).real
     which = fresh.cumsum() - 1
-    return -real.min(axis=1)[which], real.max(axis=1)[which]
+    return -real.min(axis=1, initial=0.0)[which], real.max(axis=1, initial=0.0)[which]
 
 
 def filtered(
@@ -113,7 +113,7 @@ def filtered(
     if known:
         start, sizes = own * known[0].values, own * known[0].level
     pieces, (times, levels) = list[Trajectory](), dynamics.forgetting
-    rule = _rule(outer.mesh, float(rates.max() + levels[-1]))
+    rule = _rule(outer.mesh, float(rates.max(initial=0.0) + levels[-1]))
 
     def moving(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         """Λ + ρI + 𝔸ᵀ and 𝔸 (N, p, p), and 𝕓 (N, p)."""
@@ -183,7 +183,7 @@ def _carried(
         weights = h[:, None, None] * rule.integration
         added = (weights @ added.reshape(count, rule.stages, -1)).reshape(added.shape)
         back, forth = np.asarray(np.linalg.inv(W)), np.asarray(np.linalg.inv(N))
-        largest = [np.abs(each).max(axis=(1, 2, 3)) for each in (W, N, back, forth)]
+        largest = [np.abs(x).max(axis=(1, 2, 3), initial=0.0) for x in (W, N, back, forth)]
         return [back, added, forth, np.stack(largest, axis=1)]
 
     def evaluate(
@@ -200,7 +200,8 @@ def _carried(
         kinds = []
         for part in (np.s_[..., :p], np.s_[..., p:]):
             signal = values[part].reshape(*values.shape[:2], -1)
-            kinds.append((signal, np.maximum(sizes[part].ravel(), SHARE * np.abs(signal).max())))
+            least = SHARE * np.abs(signal).max(initial=0.0)
+            kinds.append((signal, np.maximum(sizes[part].ravel(), least)))
         return (parts, values), unresolved_kinds(kinds, rule)
 
     first = maps(mesh, np.ones(mesh.size, dtype=bool))

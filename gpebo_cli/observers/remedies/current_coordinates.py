@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import repeat
+from math import prod
 from typing import TypeAlias
 
 import numpy as np
@@ -73,7 +74,6 @@ class CurrentCoordinates:
         units = np.concatenate([reduced.form.units.unknowns, reduced.units])
         start = reduced.first.at_first
         size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
-
         past = np.zeros((2, 0, len(reduced.mesh.rule.points)))
 
         def evaluate(mesh: Mesh) -> tuple[_Evaluated, list[tuple[Array, float]]]:
@@ -94,12 +94,12 @@ class CurrentCoordinates:
                 a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, more]))
             own = rows * np.append(units, 1.0) / units[q:, None]
             kinds = (*a.kinds(reduced.form.units.states), (own[..., :p], 0.0), (own[..., p], 0.0))
-            seen = [(v.reshape(*times.shape[1:], -1), floor) for v, floor in kinds]
+            seen = [(v.reshape(*times.shape[1:], prod(v.shape[1:])), floor) for v, floor in kinds]
             smallest, where = weakest(o.injectivity, o.elimination)
             return (times, a, rows, (smallest, float(t[where])), seen), seen
 
         def parts() -> Iterator[Extension]:
-            """ζ in place of the extension, on one window after the other.
+            """What is made of one window after the other, [D_0 | A_0 | b_0] as its trajectory.
 
             Those elements of windows before in which something was largest stand in front.
             """
