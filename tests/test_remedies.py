@@ -475,11 +475,11 @@ def test_filters_forget_as_fast_as_the_plant_and_not_as_w_is_held_on_constraints
 
 
 @pytest.mark.parametrize("more", [
-    {"phi": ["sin(t)"]}, {"unknowns": {"a": 2.0}, "F": [["sin(t)"]]},
+    {"phi": ["2 + sin(t)"]}, {"unknowns": {"a": 2.0}, "F": [["2 + sin(t)"]]},
 ])
 def test_states_without_derivatives_leave_nothing_that_moves(more):
     """ζ = θ, or nothing at all."""
-    plant = one_state(E=[[0]], A=[[-1]], initial_state=[0], **more)
+    plant = one_state(E=[[0]], A=[[-1]], **more)
     result = run(plant, 5.0, estimator={"name": "drem"}, remedy="current_coordinates")
     assert relative_error(result)[100:].max() < 1e-6
 
