@@ -30,6 +30,7 @@ T = TypeVar("T")
 
 LARGEST = 1e50
 """Largest number in plants, settings and samples: squares of products are numbers, too."""
+_WORDS = frozenset({str, bytes, int, float, bool, type(None)})  # what is plain as it is
 _SHOWN = 60  # characters of a wrong value that a message repeats
 
 
@@ -74,14 +75,16 @@ def shown(value: object) -> str:
 
 def plain(value: object) -> Any:
     """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
-    if hasattr(value, "toarray"):  # SciPy's sparse matrices
-        value = value.toarray()
-    if hasattr(value, "tolist"):  # NumPy's arrays and scalars
-        return plain(value.tolist())
+    if type(value) in _WORDS:  # most are, and the rest of this takes longer
+        return value
     if isinstance(value, Mapping):
         return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [plain(inner) for inner in value]
+    if hasattr(value, "toarray"):  # SciPy's sparse matrices
+        value = value.toarray()
+    if hasattr(value, "tolist"):  # NumPy's arrays and scalars
+        return plain(value.tolist())
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
@@ -217,10 +220,10 @@ def _scalar(value: object, kind: Any) -> Any:
 
 
 def _alternative(value: object, kind: Any, alternatives: Sequence[Any], where: str) -> Any:
+    if value is None and type(None) in alternatives:
+        return None
     for alternative in alternatives:
         if alternative is type(None):
-            if value is None:
-                return None
             continue
         try:
             return convert(value, alternative, where)

@@ -7,7 +7,6 @@ configuration, chooses files of groups, gives values of known keys, and may swee
 
 from __future__ import annotations
 
-import copy
 import os
 import re
 from collections.abc import Iterator, Mapping
@@ -19,7 +18,7 @@ from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, PRIMARY, conf_folde
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import read_text
-from gpebo_cli.schema import shown, unknown
+from gpebo_cli.schema import plain, shown, unknown
 
 GLOBAL = "_global_"
 """Where the content of a recipe belongs: at the top."""
@@ -81,7 +80,8 @@ def load_path(path: str, group: str) -> dict[str, Any]:
 
 def shipped(inside: str) -> dict[str, Any]:
     """A file that comes with gpebo; it is parsed once, and everybody gets a copy."""
-    return copy.deepcopy(_shipped(inside))
+    copied: dict[str, Any] = plain(_shipped(inside))
+    return copied
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import cache
 
 GROUPS = ("plant", "regression", "data", "observer", "estimator", "solver", "noise", "experiment")
 
@@ -19,6 +20,7 @@ PRIMARY = "gpebo"
 _HEAD = 1 << 16  # characters of a file that :func:`outline` looks at
 
 
+@cache
 def conf_folder() -> str:
     """The folder of configuration files: inside the installed package, else the checkout's.
 

@@ -34,9 +34,11 @@ from gpebo_cli.regression.resets import ExtensionState, level_of
 
 _PICARD_ROUNDS = 200
 _FORGOTTEN = 1e-200  # z that makes no difference to anything any more
+_LOOKED = np.geomspace(1e-4, 1.0, 86)  # of the time: there the first data that tell are sought
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
+_CLEAR = 1e11  # ‖G_z‖‖G_z⁻¹‖, up to which elimination leaves the digits that deviations need
 _NOTHING = 1e-2  # in units of rounding: an eigenvalue that is zero
 _PRIOR = 1e-3  # of what may be rounding stands for an f₀ that nobody gave
 CLEAR = 1e-8  # λ_min/λ_max, from which on the units that are given cost no digits worth a word
@@ -59,6 +61,16 @@ class Information:
         """[G_z | h_z] and z at the end."""
         memory = float(self.memory.final)
         return ExtensionState(self.gram.final, self.level, memory, began=self.began)
+
+    @cached_property
+    def told(self) -> float:
+        """When rounding no longer decides what G_z⁻¹h_z is, in seconds since ``began``, or ∞."""
+        start, end = self.gram.mesh.edges[[0, -1]].tolist()
+        t = np.append(start, start + (end - start) * _LOOKED)
+        known = self.at(t).spectrum.digits > SINGULAR
+        if not known.any():
+            return np.inf
+        return float(t[known.argmax()]) - self.began if not known[0] else 0.0
 
     def at(self, t: Array, inside: Array | None = None) -> InformationAt:
         """G_z, h_z and z at the times t (M,)."""
@@ -95,11 +107,12 @@ class InformationAt:
         """G_z = V diag(λ) Vᵀ, in the units of rounding where nothing is known at the start."""
         return self._in_units(self.units)
 
+    def _gram(self, units: Array | None) -> Array:
+        G = self.values[..., : self.values.shape[-2]]
+        return G if units is None else G / units[..., None] / units[:, None]
+
     def _in_units(self, units: Array | None) -> Spectrum:
-        p = self.values.shape[-2]
-        G = self.values[..., :p]
-        if units is not None:
-            G = G / units[..., None] / units[:, None]
+        G, p = self._gram(units), self.values.shape[-2]
         eigenvalues, vectors = np.linalg.eigh(G)
         if units is None:
             rotated = transpose(vectors) @ self.values[..., p:]
@@ -138,6 +151,35 @@ class InformationAt:
             values[..., :p] /= transpose(unit)
         _, found, _ = laws.mixed(values, self.memory * (f0 / alpha))
         return np.asarray(found / unit + start[:, None])
+
+    def mixing(self, alpha: float, f0: float) -> tuple[Array, Array, Array]:
+        """Δ = det H (M,), adj(H) αF = Δ G_z⁻¹ (M, p, p), and digits where they may be few (M,).
+
+        With H⁻¹ = I + z f₀ (α G_z)⁻¹, by elimination; by the spectrum where that has no digits.
+        """
+        G = self._gram(self.units)
+        eye = np.broadcast_to(np.eye(G.shape[1]), G.shape)
+        _, inverse, condition = laws.mixed(np.concatenate([G, eye], axis=2), None)
+        rest = ~(condition < _CLEAR)
+        inverse[rest] = 0.0
+        delta = 1.0 / np.linalg.det(eye + (self.memory * (f0 / alpha))[:, None, None] * inverse)
+        adjugate, digits = delta[:, None, None] * inverse, np.ones(len(G))
+        if self.units is not None:
+            adjugate /= self.units[..., None] * self.units[:, None]
+        if rest.any():
+            own = None if self.units is None else self.units[rest]
+            s = InformationAt(self.values[rest], self.memory[rest], own).spectrum
+            delta[rest], weights = s.adjugate(alpha, f0)
+            adjugate[rest] = (s.vectors * weights[:, None]) @ transpose(s.vectors)
+            digits[rest] = s.digits
+        return delta, adjugate, digits
+
+    def forgetting(self, alpha: float, f0: float, beta: float, bound: float | None) -> Array:
+        """β, or β (1 − ‖F‖/M) with a bound M, (M,)."""
+        if bound is None:
+            return np.full(len(self.memory), beta)
+        smallest = alpha * self.spectrum.eigenvalues[:, 0] + self.memory * f0
+        return np.asarray(beta * (1.0 - 1.0 / (smallest * bound)))
 
     @cached_property
     def in_own_units(self) -> Spectrum:
@@ -180,6 +222,14 @@ class Spectrum:
         """Eigenvalues of αF, (M, p); times those of G_z, what the data decide of each direction."""
         return np.asarray(alpha / (alpha * self.eigenvalues + (self.memory * f0)[:, None]))
 
+    def adjugate(self, alpha: float, f0: float) -> tuple[Array, Array]:
+        """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
+        share = self.share(alpha, f0)
+        h, others = share * self.eigenvalues, np.empty_like(share)  # eigenvalues of H
+        for i in range(h.shape[1]):
+            others[:, i] = np.prod(np.delete(h, i, axis=1), axis=1)
+        return np.prod(h, axis=1), others * share
+
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), zero where it is rounding, and to how many digits (M,)."""
         known = (self.digits > SINGULAR)[:, None, None]
@@ -193,13 +243,6 @@ class Spectrum:
         if self.units is not None:
             share = np.where(self.eigenvalues > _NOTHING, share, 0.0)
         return np.asarray((self.vectors * share[:, None]) @ transpose(self.vectors))
-
-    def forgetting(self, alpha: float, f0: float, beta: float, bound: float | None) -> Array:
-        """β, or β (1 − ‖F‖/M) with a bound M, (M,)."""
-        if bound is None:
-            return np.full(len(self.memory), beta)
-        smallest = alpha * self.eigenvalues[:, 0] + self.memory * f0
-        return np.asarray(beta * (1.0 - 1.0 / (smallest * bound)))
 
 
 def check_held(regression: LinearRegression, count: int) -> None:

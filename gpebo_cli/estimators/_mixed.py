@@ -8,6 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from gpebo_cli import kernels
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, Mixed, ScalarLaw, mix_sampled
 from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_law
@@ -22,6 +23,8 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
+
+_CLEAR = 1e11  # ‖Ω‖‖Ω⁻¹‖, up to which elimination leaves more digits than deviations need
 
 
 def filter_rates(rates: object, parameters: Sequence[str]) -> Array:
@@ -73,7 +76,7 @@ class FilteredEstimator(ResumableEstimator):
         extended = self.extend(regression, rates, known[0].values if known else None)
 
         def at(t: Array, inside: Array) -> tuple[Array, Array, Array]:
-            delta, adjugate, _ = determinant_and_adjugate_action(extended(t, inside)[..., :p])
+            delta, adjugate = determinant_and_adjugate(extended(t, inside)[..., :p])
             return rates[:, None] * self.seen(regression.psi(t, inside)), delta, adjugate
 
         return rates, at
@@ -102,6 +105,20 @@ class FilteredEstimator(ResumableEstimator):
     def size(self, regression: LinearRegression) -> Array:
         """What no filter's diagonal (p,) exceeds."""
         return level_of(regression.outer.values)
+
+
+def determinant_and_adjugate(omega: Array) -> tuple[Array, Array]:
+    """det(Ω) (N,) and adj(Ω) of Ω (N, p, p): by elimination, and by its SVD where that is rounding.
+
+    Deviations need three digits, and SVDs are most of the time that they take.
+    """
+    extended = np.concatenate([omega, np.broadcast_to(np.eye(omega.shape[1]), omega.shape)], axis=2)
+    delta, inverse, condition = kernels.laws.mixed(extended, None)
+    rest = ~(condition < _CLEAR)
+    inverse[rest] = 0.0
+    adjugate = delta[:, None, None] * inverse
+    delta[rest], adjugate[rest], _ = determinant_and_adjugate_action(omega[rest])
+    return delta, adjugate
 
 
 def scalar_errors(

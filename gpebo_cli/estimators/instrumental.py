@@ -23,13 +23,14 @@ from gpebo_cli.estimators._base import WindowedEstimator, gain
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
+    determinant_and_adjugate,
     mixed_estimates,
     scalar_errors,
 )
 from gpebo_cli.estimators._recursive import Mixed, mix_sampled
 from gpebo_cli.estimators._scalar import mix
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
@@ -117,7 +118,7 @@ class Instrumental(WindowedEstimator):
         def at(gain: Array, t: Array, inside: Array) -> ErrorSystem:
             rows = means(t, inside)
             left = self.left(rows, names)
-            delta, adjugate, _ = determinant_and_adjugate_action(left @ rows[..., :p])
+            delta, adjugate = determinant_and_adjugate(left @ rows[..., :p])
             rate = 1.0 / (self.settle + t - began)
             rates = np.repeat(rate[:, None], 2 * p, axis=1)
             into = rates[..., None] * lagged(regression, self.delay, t, inside)

@@ -87,10 +87,10 @@ class LeastSquares(ResumableEstimator):
         def at(
             case: Mapping[str, float], info: Information, t: Array, inside: Array
         ) -> ErrorSystem:
-            s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
-            rate = s.forgetting(case["alpha"], f0_of(case), case["beta"], self.covariance_bound)
+            here, into = info.at(t, inside), transpose(regression.psi(t, inside))
+            rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], self.covariance_bound)
             A = -rate[:, None, None] * np.eye(regression.p)
-            C = s.covariance(case["alpha"], f0_of(case))
+            C = here.spectrum.covariance(case["alpha"], f0_of(case))
             return ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
 
         infos = self.informations(regression, known)

@@ -37,6 +37,9 @@ from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _AT_ONCE = 4096  # elements
 _NO_TIME = 1e-300  # seconds, at the start
+# A law of the rate 50/t forgets what rounding made of the first data that tell anything. It is
+# followed from the first of these times on, and known from the second one on, in times they took.
+_WITHOUT, _FORGOTTEN = 1.25, 1.5
 _F0 = 1e-4  # beside a γ that is given
 
 
@@ -78,20 +81,29 @@ class LsDrem(ResumableEstimator):
         return super().axes()
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
-        """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case."""
+        """δh_z as of least squares, δη̂' = γΔ(adj(H) αF δh_z − Δ δη̂), of every case.
+
+        Without an f₀ rounding decides at first what 𝐘/Δ is, and errors are unknown until that is
+        forgotten.
+        """
         part = self.least_squares
 
         def at(
             case: Mapping[str, float], info: Information, gain: Array, t: Array, inside: Array
         ) -> ErrorSystem:
-            s, into = info.at(t, inside).spectrum, transpose(regression.psi(t, inside))
-            rate = s.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
-            delta, weights = _adjugate(s, case["alpha"], f0_of(case))
+            here, into = info.at(t, inside), transpose(regression.psi(t, inside))
+            rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
             if self.gamma is None:
                 gain = gain * one_over_memory(t, case["beta"], info.began)[:, None]
-            adjugate = (s.vectors * weights[:, None]) @ transpose(s.vectors)
-            rates = np.broadcast_to(rate[:, None], weights.shape)
-            return scalar_errors(rates, into, delta, adjugate, gain)
+            delta, adjugate, digits = here.mixing(case["alpha"], f0_of(case))
+            rates = np.broadcast_to(rate[:, None], adjugate.shape[:2])
+            if here.units is None:
+                return scalar_errors(rates, into, delta, adjugate, gain)
+            elapsed = t - info.began
+            delta[(digits <= SINGULAR) | (elapsed < _WITHOUT * info.told)] = 0.0
+            found = scalar_errors(rates, into, delta, adjugate, gain)
+            unknown = (digits <= SINGULAR) | (elapsed < _FORGOTTEN * info.told)
+            return found._replace(C=np.where(unknown[:, None, None], np.nan, found.C))
 
         pairs = zip(part.cases, part.informations(regression, known), strict=True)
         gains = self.gains("gamma", regression.parameters)
@@ -164,7 +176,7 @@ def mix_least_squares(
         Y = delta[:, None, None] * quotient
         if info.units is None:
             known = (digits > SINGULAR)[:, None, None]
-            Y = np.where(known, Y, s.vectors @ (_adjugate(s, alpha, f0)[1][..., None] * s.rotated))
+            Y = np.where(known, Y, s.vectors @ (s.adjugate(alpha, f0)[1][..., None] * s.rotated))
         return delta, Y.reshape(len(t), -1), digits
 
     shape = mesh.points.shape
@@ -191,15 +203,6 @@ def _mixed_at(
     delta = np.prod(at.spectrum.eigenvalues * at.spectrum.share(alpha, f0), axis=1)
     quotient, digits = at.in_own_units.quotient()
     return delta, quotient, digits, at.spectrum
-
-
-def _adjugate(s: Spectrum, alpha: float, f0: float) -> tuple[Array, Array]:
-    """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
-    share = s.share(alpha, f0)
-    h, others = share * s.eigenvalues, np.empty_like(share)  # eigenvalues of H
-    for i in range(h.shape[1]):
-        others[:, i] = np.prod(np.delete(h, i, axis=1), axis=1)
-    return np.prod(h, axis=1), others * share
 
 
 ESTIMATOR = LsDrem

@@ -22,8 +22,9 @@ from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import among
 from gpebo_cli.numerics.linalg import transpose, triangular
-from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.mesh import Mesh, Sampler
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
@@ -31,15 +32,16 @@ from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _STAGES = 5  # order 9: a deviation needs three digits, and elements end at the samples
-_ELEMENTS = 200  # about so many at least
-_MOST_PARTS = 8
-# Behind a start laws may go as a power of the time since then.
-_SINCE = 24  # parts at least of that time
-_HALVINGS = 8  # of the first row there
+_TOLERANCE = 1e-3  # of a deviation, in the last coefficient of an element: more is cut,
+_CUTS = 2  # at most so often: behind a start laws may go as a power of the time since then,
+_FIRST = 200  # elements between rows behind a start: later ones are short beside that time,
+_GRADED = 0.5 ** np.arange(1, 8)  # of the first row, where elements end there
+_BEYOND = 30.0  # rates times steps, from which on nothing of a layer is left at the end
+_NOTHING = 1e-9  # of the largest deviation of a component: smaller ones are none
 _SHORTEST = 1e-12  # of the times: where an element is shorter, its nodes are rounding
 _LONGER = 3.0  # times as long as the element before it is each one in a layer behind a sample
 _FASTEST = 0.1 / float(np.finfo(float).eps)  # rates times the horizon: their rounding moves s
-_LOOKED = 16  # elements, about, in which rates are looked at
+_SNAP = 1e-6  # of a row
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
 _LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
@@ -81,6 +83,7 @@ def deviations(
 
 
 def _agree(coarse: Array, fine: Array) -> bool:
+    coarse, fine = np.nan_to_num(coarse), np.nan_to_num(fine)  # where they are unknown
     largest = fine.max(axis=0, initial=0.0)
     return bool((np.abs(coarse - fine) <= _AGREE * (fine + _AGREE * largest)).all())
 
@@ -91,63 +94,171 @@ def _propagated(
 ) -> tuple[Array, Array]:
     """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
     n, p = gain.shape[1:]
-    mesh = _mesh(edges, groups, np.union1d(starts, [time for time, _ in resets]))
-    some = _joint(observer, estimator, mesh, slice(None, None, -(-mesh.size // _LOOKED)), n)
-    if (rate := _rate(some)) * (edges[-1] - edges[0]) > _FASTEST:
-        return np.full((len(t), p), np.nan), np.full((len(t), n), np.nan)
-    mesh = _layered(mesh, groups.starts, rate, t)
-    fresh, group = _group_of(mesh, groups.starts)
-    until = np.append(groups.starts[1:], np.inf)
-    sampler = mesh.sampler(t)
+    begun = np.union1d(starts, [time for time, _ in resets])
+    mesh = _mesh(edges, groups, begun)
+    anew = mesh.edges[np.searchsorted(mesh.edges, starts)]
+    turns = {float(mesh.edges[np.searchsorted(mesh.edges, time)]): turn for time, turn in resets}
+    cut_until = mesh.edges[(np.searchsorted(mesh.edges, begun) + _FIRST).clip(max=mesh.size)]
+    chain = _Chain(observer, estimator, n, groups, variances, anew, turns, (begun, cut_until))
     of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
-    zeta, own = (x(mesh.edges[:1], mesh.inside[0, :1]).A.shape[1] for x in (observer, estimator))
-    size, signals = zeta + own, len(variances)
-    stretch = max(1, _CHUNK // (size * mesh.rule.stages) ** 2)
-    anew = np.zeros(mesh.size, dtype=bool)
-    anew[np.searchsorted(mesh.edges, starts)] = True
-    turns = {int(k): np.pad(np.eye(own), ((zeta, 0), (zeta, 0))) for k in np.flatnonzero(anew)}
-    for time, turn in resets:
-        turns[int(np.searchsorted(mesh.edges, time))] = np.pad(turn, ((zeta, 0), (0, 0)))
-    L: Array | None = None
-    # The errors that count in an element.
-    beside = groups.first[group, None] + np.arange(1 + groups.memory.shape[1])
-    beside = beside.clip(max=len(groups.shares) - 1)
-    shares, memory = groups.shares[beside], groups.memory[beside]
-    for first in range(0, mesh.size, stretch):
-        part = slice(first, first + stretch)
-        joint = _joint(observer, estimator, mesh, part, n)
-        weights = groups.weights(mesh.points[part, 1:], group[part, None], until)
-        B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
-        maps = _maps(mesh, mesh.steps[part], joint.A, B)  # of [ζ; s]
-        chosen = (sampler.element >= first) & (sampler.element < first + stretch)
-        element, places = sampler.element[chosen], sampler.weights[chosen]
-        wanted, place = np.unique(element - first, return_inverse=True)
-        factors, L = _factors(
-            maps[:, -1], fresh[part], anew[part], shares[part, :, None] * np.sqrt(variances),
-            memory[part], L, {k - first: turn for k, turn in turns.items()}, wanted,
-        )
-        if not len(wanted):
+    stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
+    cuts = mesh.edges[stretch:-1:stretch]
+    all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
+    for first, chosen in zip(range(0, mesh.size, stretch), all_t, strict=True):
+        part = Mesh(mesh.edges[first : first + stretch + 1], mesh.rule)
+        part, joint = chain.looked(part, t[chosen])
+        if chain.rate * (edges[-1] - edges[0]) > _FASTEST:
+            return np.full(of_eta.shape, np.nan), np.full(of_x.shape, np.nan)
+        part, maps, factors, (common, varies) = chain.along(part, joint, t[chosen])
+        if not len(chosen):
             continue
-        before = factors[place]
-        here = np.einsum("ms,msij->mij", places[:, 1:], maps[element - first])
-        here[:, :, :size] += places[:, 0, None, None] * np.eye(size)
+        zeta, size, signals = chain.zeta, maps.shape[2], len(variances)
+        sampler = part.sampler(t[chosen])
+        element, places = sampler.element, sampler.weights
+        before, group = factors[element], _group_of(part, groups.starts)[element]
+        here = Sampler(element, places[:, 1:])(maps)
+        np.einsum("mii->mi", here[:, :, :size])[...] += places[:, :1]
         reached = here @ before  # of [ζ; s] (M, size, ·)
-        inside = mesh.inside[element, 1]
-        o = observer(t[chosen], inside)
-        C = joint.C if len(joint.C) == 1 else estimator(t[chosen], inside).C  # alike at all times
-        eta = C @ reached[:, zeta:]
+        inside = part.inside[element, 1]
+        o = chain.observer(t[chosen], inside)
+        eta = common @ reached[:, zeta:]
+        if len(own_C := varies[element].nonzero()[0]):
+            C = estimator(t[chosen][own_C], inside[own_C]).C
+            eta[own_C] = C @ reached[own_C, zeta:]
         rows = o.C.shape[1] - n  # of Y; those of the offset stand below
-        now = groups.weights(t[chosen], group[element], groups.after)
+        now = groups.weights(t[chosen], group, groups.after)
         if not groups.alone:  # errors of one row and the one behind it, not of many
-            now = now / shares[element].T
+            now = now / chain.shares[group].T
         e_now = sum(
             each[:, None, None] * before[:, size + k * signals : size + (k + 1) * signals]
             for k, each in enumerate(now)
         )
         x = gain[chosen] @ eta
         x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
-        of_eta[chosen], of_x[chosen] = np.linalg.norm(eta, axis=2), np.linalg.norm(x, axis=2)
+        of_eta[chosen], of_x[chosen] = _sizes(eta), _sizes(x)
+    if chain.unknown:  # one row alone says nothing of that, but rounding does
+        row = groups.after[0] - groups.starts[0]
+        for each in (of_eta, of_x):
+            each[t < groups.after[0] + _SNAP * row] = np.nan
     return of_eta, of_x
+
+
+def _sizes(rows: Array) -> Array:
+    """Of each row of matrices (M, k, ·): (M, k)."""
+    return np.asarray(np.sqrt(np.einsum("mki,mki->mk", rows, rows)))
+
+
+class _Chain:
+    """A factor L of the covariance that goes from element to element; it remembers the last L."""
+
+    rate = 0.0  # in 1/s, the fastest one of what errors of samples move directly
+    zeta = 0  # how many ζ are
+    unknown: bool | None = None  # whether C is NaN at the start
+
+    def __init__(
+        self, observer: ErrorsAt, estimator: ErrorsAt, n: int, groups: Groups, variances: Array,
+        anew: Array, turns: Mapping[float, Array], cuts: tuple[Array, Array],
+    ) -> None:
+        """Prepare for the first element.
+
+        All errors begin anew at edges ``anew``; at those of ``turns`` s is made of [ζ; s], and ζ is
+        zero. Elements may be ``cuts`` from times of the first kind to those of the second.
+        """
+        self._observer = self.observer = observer  # asked once where it is alike at all times
+        self._behind, self._groups, self._anew, self._turns = (
+            (estimator, n), groups, anew.tolist(), turns
+        )
+        # The errors that count from the start of each group on.
+        beside = groups.first[:, None] + np.arange(1 + groups.memory.shape[1])
+        beside = beside.clip(max=len(groups.shares) - 1)
+        self.shares, self._memory = groups.shares[beside], groups.memory[beside]
+        self._deviations = self.shares[..., None] * np.sqrt(variances)
+        self._until = np.append(groups.starts[1:], np.inf)
+        self._cuts = cuts
+        self._L: Array | None = None
+        self._group = -1  # the last one
+
+    def looked(self, mesh: Mesh, t: Array) -> tuple[Mesh, ErrorSystem]:
+        """The next elements with layers where times t (M,) are, and their joint system."""
+        joint, o = _joint(self._observer, *self._behind, mesh, slice(None))
+        if self.unknown is None:
+            self.unknown = bool(np.isnan(joint.C[0]).any())
+        self.zeta, alike = o.A.shape[1], all(len(part) == 1 for part in o)
+        self.observer = (lambda *_: o) if alike else self._observer
+        rates = np.abs(np.einsum("ksii->ksi", joint.A)[joint.B.any(axis=3)])
+        self.rate = max(self.rate, float(rates.max(initial=0.0)))
+        layered = _layered(mesh, self._groups.starts, self.rate, t)
+        if layered.size == mesh.size:
+            return mesh, joint
+        return layered, _joint(self.observer, *self._behind, layered, slice(None))[0]
+
+    def along(
+        self, mesh: Mesh, joint: ErrorSystem, t: Array
+    ) -> tuple[Mesh, Array, Array, tuple[Array, BoolArray]]:
+        """These elements, cut until all is resolved that decides what is at times t (M,).
+
+        And what they make of L at their left ends for [ζ; s] at the nodes, these L, and C at the
+        end, with the elements in which it is another one.
+        """
+        new, cuts = np.ones(mesh.size, dtype=bool), 0
+        while True:
+            group = _group_of(mesh, self._groups.starts)
+            weights = self._groups.weights(mesh.points[new, 1:], group[new, None], self._until)
+            B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
+            made = _maps(mesh, mesh.steps[new], joint.A, B)
+            C = joint.C if len(joint.C) > 1 else joint.C.repeat(made[:, :, 0, 0].size, axis=0)
+            if not cuts:
+                maps, common, varies = made, C[-1], np.empty(mesh.size, dtype=bool)
+            maps[new] = made
+            varies[new] = (common != C).reshape(len(made), -1).any(axis=1)
+            left = mesh.edges[:-1]
+            factors, end = _factors(
+                maps[:, -1], np.diff(group, prepend=self._group) > 0, np.isin(left, self._anew),
+                self._deviations[group], self._memory[group], self._L, self._turned(left, maps),
+            )
+            poor = self.rate * mesh.steps < _BEYOND
+            poor[mesh.sampler(t).element] = True
+            poor &= (mesh.steps > _SHORTEST * np.abs(mesh.edges).max()) & (cuts < _CUTS)
+            begun, until = self._cuts
+            poor &= left < until[np.searchsorted(begun, left, side="right").clip(1) - 1]
+            if poor.any():
+                tail = _tails(mesh, maps, factors, end, self.zeta)
+                poor &= tail > _TOLERANCE * 10.0**cuts
+            if not poor.any():
+                self._L, self._group = end, int(group[-1])
+                return mesh, maps, factors, (common, varies)
+            mesh, kept = mesh.split(wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages))
+            maps, varies, new, cuts = maps[kept], varies[kept], kept < 0, cuts + 1
+            joint = _joint(self.observer, *self._behind, mesh, new)[0]
+
+    def _turned(self, left: Array, maps: Array) -> dict[int, Array]:
+        """What makes [ζ; s] of itself (d, d) at the ``left`` ends of some elements, by number."""
+        zeta, eye = self.zeta, np.eye(maps.shape[2])[self.zeta :]
+        eye[:, :zeta] = 0.0
+        edges = dict.fromkeys(self._anew, eye) | dict(self._turns)
+        return {
+            k: np.pad(edges[time], ((zeta, 0), (0, 0)))
+            for k, time in enumerate(left.tolist()) if time in edges
+        }
+
+
+def _tails(mesh: Mesh, maps: Array, factors: Array, end: Array, zeta: int) -> Array:
+    """The last Legendre coefficient of the factors in each element, relative to their size, (K,).
+
+    ``maps`` make of the ``factors`` at the left ends those at the nodes, and the last of them is
+    followed by that at the ``end``. The worst of all components of [ζ; s] counts, each in its unit.
+    Of ζ what is nothing beside the rest of it and the errors is rounding.
+    """
+    size, legendre = maps.shape[2], mesh.rule.to_legendre[-1]
+    last = np.einsum("s,ksij->kij", legendre[1:], maps)
+    last[:, :, :size] += legendre[0] * np.eye(size)
+    sizes = _sizes(np.concatenate([factors, end[None]]))
+    rest = np.delete(sizes, np.s_[zeta:size], axis=1).max(initial=0.0)
+    scale = np.maximum(sizes[1:, :size], sizes[:-1, :size])
+    least = scale.max(axis=0, initial=0.0)
+    least[:zeta] = rest
+    scale = np.maximum(scale, _NOTHING * least + np.finfo(float).tiny)
+    return np.asarray((_sizes(last @ factors) / scale).max(axis=1, initial=0.0))
 
 
 def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None) -> Array:
@@ -164,7 +275,8 @@ def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None)
         J[:p, zeta : zeta + p] = known.carries(reset)
         J[:p, :zeta] = -known.after(reset).values[:, :p] @ V
     if known is None or own > p:  # the last p of s are δη̂ itself
-        J[-p:, zeta:], J[-p:, :zeta] = reset.transform @ system.C[0], -V
+        # What is unknown then is forgotten when the data tell more.
+        J[-p:, zeta:], J[-p:, :zeta] = reset.transform @ np.nan_to_num(system.C[0]), -V
     return J
 
 
@@ -278,19 +390,9 @@ def _mesh(edges: Array, groups: Groups, starts: Array) -> Mesh:
     own = own[(own > edges[0]) & (own < edges[-1])]
     coarse = np.union1d(edges[inner], own)
     first = np.searchsorted(coarse, starts).clip(max=len(coarse) - 2)
-    begun = coarse[first]
-    early = np.diff(coarse)[first, None] * 0.5 ** np.arange(1, _HALVINGS)
+    early = np.diff(coarse)[first, None] * _GRADED
     early[early < _SHORTEST * np.abs(coarse).max()] = 0.0
-    mesh = Mesh(np.union1d(coarse, begun[:, None] + early), radau_rule(_STAGES))
-    since = mesh.edges[1:] - begun[np.searchsorted(begun, mesh.edges[1:]).clip(1) - 1]
-    parts = np.maximum(_ELEMENTS / (len(coarse) - 1), _SINCE * mesh.steps / since)
-    return mesh.split(np.ceil(parts).clip(max=_MOST_PARTS).astype(np.intp))[0]
-
-
-def _rate(joint: ErrorSystem) -> float:
-    """The fastest rate, in 1/s, of what the errors of samples move directly."""
-    moved = joint.B.any(axis=3)
-    return float(np.abs(np.einsum("ksii->ksi", joint.A)[moved]).max(initial=0.0))
+    return Mesh(np.union1d(coarse, coarse[first, None] + early), radau_rule(_STAGES))
 
 
 def _layered(mesh: Mesh, instants: Array, rate: float, t: Array) -> Mesh:
@@ -299,22 +401,22 @@ def _layered(mesh: Mesh, instants: Array, rate: float, t: Array) -> Mesh:
     The end of an element beyond the layer is accurate, but no polynomial goes through both of its
     ends. Only elements in which there are times of the output t (M,) are cut.
     """
-    begins, sampler = _group_of(mesh, instants)[0], mesh.sampler(t)
+    if rate * mesh.steps.max(initial=0.0) <= 1.0:
+        return mesh
+    begins, sampler = np.diff(_group_of(mesh, instants), prepend=-1) > 0, mesh.sampler(t)
     between = np.count_nonzero(sampler.weights, axis=1) > 1  # and not at a node
     begins &= np.bincount(sampler.element[between], minlength=mesh.size) > 0
     h, left = mesh.steps[begins], mesh.edges[:-1][begins]
-    fast = rate * h.max(initial=0.0)
-    cuts = int(np.ceil(np.log(max(fast, 1.0)) / np.log(_LONGER)))
+    cuts = int(np.ceil(np.log(max(rate * h.max(initial=0.0), 1.0)) / np.log(_LONGER)))
     parts = h * _LONGER ** -np.arange(1.0, 1.0 + cuts)[:, None]
     useful = (rate * parts * _LONGER > 1.0) & (parts > _SHORTEST * np.abs(mesh.edges).max())
     return Mesh(np.union1d(mesh.edges, (left + parts)[useful]), mesh.rule)
 
 
-def _group_of(mesh: Mesh, instants: Array) -> tuple[BoolArray, IntArray]:
-    """Whether a group, each from its instant on, begins with an element, and which it is in."""
+def _group_of(mesh: Mesh, instants: Array) -> IntArray:
+    """Which group, each from its instant on, every element is in."""
     middle = mesh.edges[:-1] + 0.5 * mesh.steps
-    group = np.searchsorted(instants, middle, side="right").clip(1) - 1
-    return np.diff(group, prepend=-1) > 0, group
+    return np.asarray(np.searchsorted(instants, middle, side="right").clip(1) - 1)
 
 
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
@@ -365,9 +467,12 @@ def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) 
 
 
 def _joint(
-    observer: ErrorsAt, estimator: ErrorsAt, mesh: Mesh, part: slice, n: int
-) -> ErrorSystem:
-    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at the nodes of some elements; C of s."""
+    observer: ErrorsAt, estimator: ErrorsAt, n: int, mesh: Mesh, part: BoolArray | slice
+) -> tuple[ErrorSystem, ErrorSystem]:
+    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at nodes of some elements, and C of s.
+
+    Beside it stands the system of ζ at all of these nodes.
+    """
     points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
     o, e = observer(points, inside), estimator(points, inside)
     zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
@@ -380,14 +485,15 @@ def _joint(
     B[:, :zeta] = o.B
     B[:, zeta:] = e.B @ o.D[:, :rows]
     shape = (-1, mesh.rule.stages, zeta + own)
-    return ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
+    system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
+    return system, o
 
 
 def _factors(
     ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, memory: Array,
-    L: Array | None, turns: Mapping[int, Array], wanted: IntArray,
+    L: Array | None, turns: Mapping[int, Array],
 ) -> tuple[Array, Array]:
-    """L of [ζ; s; e] at the left ends of elements ``wanted`` (W, d + a (m + r), ·), and at the end.
+    """L of [ζ; s; e] at the left ends of elements (K, d + a (m + r), ·), and at the end.
 
     The errors of several rows stand in L side by side, before it is made triangular again. An
     element makes ``ends`` of it (K, d, d + a (m + r)). Of the a errors that count, with
@@ -401,12 +507,11 @@ def _factors(
     L = np.zeros((whole, whole)) if L is None else L
     used = L.shape[1]
     L = np.pad(L, ((0, 0), (0, width - used)))
-    out, told = np.empty((len(wanted), *L.shape)), 0
-    asked = np.isin(np.arange(len(ends)), wanted).tolist()
+    out, kept = np.empty((len(ends), *L.shape)), np.where(anew, 0, alive - fresh).tolist()
     for k, end in enumerate(ends):
         if k in turns:
             L[:size] = turns[k] @ L[:size]
-        for block in range(0 if anew[k] else alive - fresh[k], alive):
+        for block in range(kept[k], alive):
             if used == width:
                 L[:, :whole] = np.asarray(np.linalg.qr(L.T, mode="r")).T
                 L[:, whole:] = 0.0
@@ -419,8 +524,7 @@ def _factors(
                     L[whole - signals :] += share * L[before : before + signals]
             L[whole - signals + own, used + own] = deviations[k, block]
             used += signals
-        if asked[k]:
-            out[told], told = L, told + 1
+        out[k] = L
         L[:size] = end @ L
     return out, L
 

@@ -21,7 +21,10 @@ MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not 
 # Why there are no deviations.
 _MANY = f"each of {{}} cases would take a pass of its own, which up to {MOST_CASES} do"
 _FEW = "the samples are so few that the estimates leave nothing of them to tell their noise"
-_FAST = "the gain is so large that in double precision rounding moves the estimate"
+_ROUNDING = (
+    "the gain is so large, or the samples tell so little, that in double precision rounding moves "
+    "the estimate"
+)
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
 _IN_MATRICES = (
     "noise of the signals is in the matrices (of outputs observer.remedy=noise_free takes it out) "
@@ -132,7 +135,7 @@ def standard_deviations(
         for (of_case, resets), gain in zip(behind(estimator, regression), gains, strict=True)
     ]
     of_eta, of_x = (np.array(each) for each in zip(*found, strict=True))
-    return _FAST if np.isnan(of_eta).all() else (of_eta, of_x)
+    return _ROUNDING if np.isnan(of_eta).all() else (of_eta, of_x)
 
 
 def _level(

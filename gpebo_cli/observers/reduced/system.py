@@ -28,6 +28,7 @@ from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 
+_MATRICES = frozenset("EABFCDH")
 AT_ONCE = 1 << 15  # points: what is made of all of them at once is what takes the memory
 SMALL = 8  # coordinates of w, up to which dense collocation is faster
 
@@ -134,11 +135,20 @@ class ReducedSystem(Formulation):
 
     def matrices(self, t: Array, inside: Array) -> ObserverMatrices:
         """The matrices at the times t (N,), with output injection."""
+        o = self._constant or self._moving(t, inside)
+        return o if self.injection is None else o.injected(self.injection(o, t, inside))
+
+    @cached_property
+    def _constant(self) -> ObserverMatrices | None:
+        if self.form.follows_signals or _MATRICES - self.system.coefficients.constant:
+            return None
+        return self.first.at_first
+
+    def _moving(self, t: Array, inside: Array) -> ObserverMatrices:
         signals = self.signals.at(t, inside, self.system) if self.form.follows_signals else None
-        o = observer_matrices(
+        return observer_matrices(
             self.form, t, inside, self.solver.rank_tol, self.first, signals=signals
         )
-        return o if self.injection is None else o.injected(self.injection(o, t, inside))
 
     def measured(self, t: Array, inside: Array) -> Array:
         """[v; y] (N, v + r, 1) at the times t (N,)."""
