@@ -699,7 +699,7 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     def always(value):
         return Trajectory(mesh, np.broadcast_to(value, (*mesh.points.shape, *np.shape(value))))
 
-    dynamics = Dynamics(always(np.diag([0.1, -1.0])), always(np.zeros(2)), np.ones(2))
+    dynamics = Dynamics(always([[0.1, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.ones(2))
     least = (1.0 + np.log(100.0)) / 160.0
     gains = share * least * np.array([[1.0], [5.0]])
     found = follow(always(2.0 * np.eye(2, 3)), dynamics, np.zeros(2), gains, T).requirement

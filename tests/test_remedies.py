@@ -12,7 +12,7 @@ import yaml
 from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plants import experiment, left_of_identities, shipped
+from plants import experiment, left_of_identities, one_state, shipped
 from plants import observed as along
 from processes import assert_refused, refused
 from regressions import ETA, three
@@ -474,6 +474,16 @@ def test_filters_forget_as_fast_as_the_plant_and_not_as_w_is_held_on_constraints
     assert result.estimation.parameters[0, -1, 0] == pytest.approx(0.7, abs=0.01)
 
 
+@pytest.mark.parametrize("more", [
+    {"phi": ["2 + sin(t)"]}, {"unknowns": {"a": 2.0}, "F": [["2 + sin(t)"]]},
+])
+def test_states_without_derivatives_leave_nothing_that_moves(more):
+    """ζ = θ, or nothing at all."""
+    plant = one_state(E=[[0]], A=[[-1]], **more)
+    result = run(plant, 5.0, estimator={"name": "drem"}, remedy="current_coordinates")
+    assert relative_error(result)[100:].max() < 1e-6
+
+
 class Outsider:
     """An estimator of another package, with no more than the protocol."""
 
@@ -573,10 +583,9 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
         psi = np.array([1.0 + 0.0 * t, np.sin(3.0 * t)])
         return A, np.array([np.sin(t), np.cos(t)]), psi[:, None] * np.array([*psi, np.cos(t)])
 
-    A, b, outer = (
-        Trajectory(mesh, np.moveaxis(x, (-2, -1), (0, 1))) for x in signals(mesh.points)
-    )
-    moves = Dynamics(A, b, np.array([1.0, 4.0]))
+    A, b, outer = (np.moveaxis(x, (-2, -1), (0, 1)) for x in signals(mesh.points))
+    rows = Trajectory(mesh, np.concatenate([A, b[..., None]], axis=3))
+    moves, outer = Dynamics(rows, np.array([1.0, 4.0])), Trajectory(mesh, outer)
     times, levels = moves.forgetting
 
     def slope(t, X, rho):
@@ -588,5 +597,6 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
     for start, stop, rho in zip([0.0, *times], [*times, 4.0], levels, strict=True):
         solved = solve_ivp(slope, (start, stop), X, "DOP853", args=(rho,), rtol=1e-12, atol=1e-12)
         X = solved.y[:, -1]
-    found = filtered(outer, rates, gains, moves, np.arange(6.0).reshape(2, 3)).final
+    begin = ExtensionState(np.arange(6.0).reshape(2, 3), 0.0)
+    found = filtered(outer, rates, gains, moves, [begin]).final
     np.testing.assert_allclose(found.ravel(), X, rtol=1e-9)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain, islice, zip_longest
 
 import numpy as np
@@ -71,11 +71,11 @@ def estimate(
     if not regression.p:  # constraints alone determine the states
         nothing = Requirement("none", True, {}, "there is nothing to estimate")
         return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)
-    if regression.dynamics is not None:
-        moving = able(estimator, Moving, _FOLLOW)
-        return moving.estimate_moving(regression, regression.dynamics, t)
     if not regression.resets:
         found = in_windows(estimator, regression, t, t if shown is None else shown)
+        if found is None and regression.dynamics is not None:
+            moving = able(estimator, Moving, _FOLLOW)
+            return moving.estimate_moving(regression, t, (), regression.dynamics)
         return estimator.estimate(regression, t) if found is None else found
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
@@ -104,6 +104,10 @@ def in_windows(
         return None
     if len(estimator.cases) * t.size * regression.p > _MOST:
         return None
+    go_on: Callable[[LinearRegression, Array, Known], WindowEstimates] = estimator.go_on
+    if regression.dynamics is not None:
+        moving = able(estimator, Moving, _FOLLOW)
+        go_on = partial(moving.estimate_moving, dynamics=regression.dynamics)
     etas: list[Array] = []
     deltas: list[Array | None] = []
 
@@ -113,7 +117,7 @@ def in_windows(
         windows = zip(windowed(regression, t), windowed(regression, shown), strict=True)
         for (own, window), (looked, _) in windows:
             end = window.mesh.edges[-1]  # there may be no other time
-            part = estimator.go_on(window, np.append(own, end), known)
+            part = go_on(window, np.append(own, end), known)
             eta, delta = part.parameters(slice(None), start), part.delta(np.append(looked, end))
             etas.append(eta[:, :-1])
             deltas.append(None if delta is None else delta[:, :-1])

@@ -17,7 +17,7 @@ from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Trajectory, joined
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.dynamics import Dynamics
-from gpebo_cli.regression.estimator import WindowEstimates
+from gpebo_cli.regression.estimator import Lasting, WindowEstimates
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.resets import ExtensionState
 
@@ -32,11 +32,12 @@ _ROUNDING = 1e-13  # smaller steps between elements are no jumps
 class VectorLaw:
     """The signals M (k, p), N (k, p) and b (k,) or (k, c) of a law on one mesh."""
 
-    M: Trajectory | None  # None: the identity
+    M: Trajectory | None  # None: the identity, or as ``mixed`` says
     N: Trajectory
     b: Trajectory
     floor: Array | float = 0.0  # (p,) size below which η̂ is rounding
     dynamics: Dynamics | None = None  # η̂' = 𝔸η̂ + 𝕓 + Γ Mᵀ (b − N η̂) for parameters that move
+    mixed: bool = False  # M and N are ΔI, and Δ (p, 1), the same in all rows, takes the place of N
 
     def solve(self, gains: Array, start: Array) -> Trajectory:
         """η̂ (p, c) for one gain vector Γ = diag(``gains``), shape (p,).
@@ -48,7 +49,8 @@ class VectorLaw:
         Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
         directions: at γ = 1e14 they would be lost. In this form the limit γ → ∞ is an
         ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
-        does, too, and starts anew; η̂ does not jump. Where M is the identity, ν is not needed.
+        does, too, and starts anew; η̂ does not jump. Where M is the identity or diagonal, ν is not
+        needed.
         """
         b = with_realisations(self.N.values, self.b.values)
         signals = [self.N.values, b] if self.M is None else [self.M.values, self.N.values, b]
@@ -73,19 +75,22 @@ class VectorLaw:
         """(η̂, ν) for [M | N | b] over a window, from η̂ (p,) or (p, c); rounding is below sizes."""
         p, residual = len(start), self.M is not None
         k, first = (self.b.values.shape[2], p) if residual else (0, 0)
-        c = packed.values.shape[-1] - first - p
+        last = first + self.N.values.shape[-1]
+        c = packed.values.shape[-1] - last
         E = np.zeros((1, p + k, p + k))
         E[0, :p, :p] = np.eye(p)
 
         def coefficients(t: Array, inside: Array) -> LinearEquation:
-            M, N, b = np.split(packed(t, inside), [first, first + p], axis=2)
+            M, N, b = np.split(packed(t, inside), [first, last], axis=2)
             A, f = np.zeros((len(t), p + k, p + k)), np.zeros((len(t), p + k, c))
             if self.dynamics is not None:
-                A[:, :p, :p] = self.dynamics.A(t, inside)
-                f[:, :p] = self.dynamics.b(t, inside)[:, :, None]
+                A[:, :p, :p], f[:, :p, 0] = self.dynamics.at(t, inside)
             if residual:
                 A[:, :p, p:] = gains[:, None] * np.swapaxes(M, 1, 2)
                 A[:, p:, :p], A[:, p:, p:], f[:, p:] = -N, -np.eye(k), b
+            elif self.mixed:
+                A -= gains[:, None] * N**2 * np.eye(p)
+                f += gains[:, None] * N * b
             else:
                 A -= gains[:, None] * N
                 f += gains[:, None] * b
@@ -123,7 +128,7 @@ def _with_residual(signals: Array, eta: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class VectorEstimates:
+class VectorEstimates(Lasting):
     """Estimates of a vector law, one integration per case when it is asked for."""
 
     law: VectorLaw
@@ -142,7 +147,9 @@ class VectorEstimates:
         return self.told or self.over([self], self.information.mesh.span)
 
     def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
-        """Persistent excitation by the information of all ``parts`` of a span."""
+        """Persistent excitation by the information of all ``parts`` of a span, or what is told."""
+        if self.told is not None:
+            return super().over(parts, span)
         each = (part.information for part in parts if isinstance(part, VectorEstimates))
         return persistent(self.information, float(self.gains.min()), each, span)
 

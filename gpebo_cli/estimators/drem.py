@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,8 +12,9 @@ from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import Known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,7 @@ class Drem(FilteredEstimator):
     """
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) at the times t (M,).
 
@@ -33,14 +34,15 @@ class Drem(FilteredEstimator):
         """
         names = regression.parameters
         rates = filter_rates(self.rates, names)
-        extended = filtered(regression.outer, rates, rates, dynamics)
+        extended = filtered(regression.outer, rates, rates, dynamics, known)
         return follow(
-            extended, dynamics, self.start(names), self.gains("gamma", names), np.asarray(t)
+            extended, dynamics, self.start(names), self.gains("gamma", names), np.asarray(t), known
         )
 
 
 def follow(
-    extended: Trajectory, dynamics: Dynamics, start: Array, gains: Array, t: Array
+    extended: Trajectory, dynamics: Dynamics, start: Array, gains: Array, t: Array,
+    known: Known = (),
 ) -> VectorEstimates:
     """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) with Δ and 𝐘 = adj(Ω)𝒴 of [Ω | 𝒴] (p, p + 1), on its mesh.
 
@@ -49,18 +51,18 @@ def follow(
     values = extended.values
     delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
     mesh = extended.mesh
-    diagonal = Trajectory(mesh, delta[..., None, None] * np.eye(values.shape[2]))
-    law = VectorLaw(diagonal, diagonal, Trajectory(mesh, Y[..., 0]), dynamics=dynamics)
-    A = dynamics.A
-    rate = Trajectory(A.mesh, np.linalg.eigvals(A.values).real.max(axis=-1))
-    grown = max(float(rate.integral().final), 0.0)
+    same = Trajectory(mesh, np.broadcast_to(delta[..., None, None], Y.shape))
+    law = VectorLaw(None, same, Trajectory(mesh, Y[..., 0]), dynamics=dynamics, mixed=True)
     mixed = Trajectory(mesh, delta)
-    energy = float(Trajectory(mesh, delta**2).integral().final)
+    energy = sum(each.energy for each in known) + float(Trajectory(mesh, delta**2).integral().final)
     requirement = energy_requirement(
-        "γ∫Δ² above the growth of the state", float(gains.min()), energy, grown + DECAY,
-        f"1 % of the initial error of a state that may grow by e^{grown:.3g}",
+        "γ∫Δ² above the growth of the state", float(gains.min()), energy, dynamics.growth + DECAY,
+        f"1 % of the initial error of a state that may grow by e^{dynamics.growth:.3g}",
     )
-    return VectorEstimates(law, start, gains, t, diagonal, requirement, mixed=mixed)
+    state = replace(state_of(extended, known), energy=energy)
+    return VectorEstimates(
+        law, start, gains, t, same, requirement, reached=(state,), mixed=mixed
+    )
 
 
 ESTIMATOR = Drem

@@ -62,10 +62,10 @@ class Gradient(ResumableEstimator):
         return RecursiveGradient(self.start(parameters), self.gains("gamma", parameters))
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + Γψᵀ(Y − ψη̂) at the times t (M,)."""
-        plain = self.resume(regression, t, ())
+        plain = self.resume(regression, t, known)
         return replace(plain, law=replace(plain.law, dynamics=dynamics))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import repeat
 
@@ -24,7 +24,7 @@ from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found, Lasting, SampledEstimates, Unmixed
 from gpebo_cli.regression.linear import LinearRegression
@@ -123,7 +123,7 @@ class LeastSquares(ResumableEstimator):
         return RecursiveLeastSquares(self, parameters)
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> Found:
         """η̂ = F 𝒴 with F⁻¹ and 𝒴 from (f₀ I, f₀ η̂₀), at the times t (M,).
 
@@ -137,22 +137,27 @@ class LeastSquares(ResumableEstimator):
         p = regression.p
         start = self.start(regression.parameters)
         prior = np.column_stack([np.eye(p), start])
-        ones = np.ones(p)
+        ones, begin = np.ones(p), (regression.whole or regression).mesh.edges[0]
+        reached = list[ExtensionState]()
 
-        def known(case: Mapping[str, float]) -> Array:
+        def extended(case: Mapping[str, float], before: ExtensionState | None) -> Array:
             """[F⁻¹ | 𝒴] at the times t, (M, p, p + 1)."""
-            gram = filtered(
-                regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics,
-                case.get("f0", 0.0) * prior,
-            )(t)
+            state = [before or ExtensionState(case.get("f0", 0.0) * prior, 0.0)]
+            found = filtered(
+                regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics, state
+            )
+            reached.append(state_of(found, state))
+            gram = found(t)
             if "f0" not in case:
                 energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
-                elapsed = t - regression.mesh.edges[0]
+                elapsed = t - begin
                 units = prior_units(energy, regression.terms(t), elapsed, rounding)
                 gram += units[..., None] ** 2 * prior
             return gram
 
-        return solved(np.array([known(case) for case in self.cases]), dynamics.units)
+        of_cases = zip(self.cases, known or repeat(None), strict=False)
+        found = solved(np.array([extended(*own) for own in of_cases]), dynamics.units)
+        return replace(found, reached=tuple(reached))
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
         """Everything but the gains, at the times t (M,).

@@ -26,7 +26,7 @@ from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
-from gpebo_cli.regression.dynamics import Dynamics, filtered
+from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.linear import LinearRegression
@@ -72,12 +72,14 @@ class MemoryExtension(ResumableEstimator):
         return tuple(partial(at, np.broadcast_to(gain, p)[:, None]) for gain in gains)
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
         """η̂' = 𝔸η̂ + 𝕓 + Γ(𝒴 − Ω η̂) at the times t (M,)."""
         rates = self._rates(regression.p)
-        plain = self._estimates(regression, filtered(regression.outer, rates, rates, dynamics), t)
-        return replace(plain, law=replace(plain.law, dynamics=dynamics))
+        extended = filtered(regression.outer, rates, rates, dynamics, known)
+        plain = self._estimates(regression, extended, t)
+        law = replace(plain.law, dynamics=dynamics)
+        return replace(plain, law=law, reached=(state_of(extended, known),))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMemoryExtension:
         """The estimator at samples."""

@@ -6,9 +6,9 @@ Interval excitation, as the paper's Assumption 2 means it, is G(t_c) = ∫ψᵀ�
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -103,16 +103,31 @@ def assess(
     horizon = float(mesh.edges[-1] - mesh.edges[0])
     window = settings.window if settings.window is not None else horizon / WINDOWS
     # What is looked at later must not keep what is known of this regression by now.
-    later = replace(regression)
+    later, ends = replace(regression), list[tuple[Array, Array]]()
 
-    def eigenvalues(at: Array) -> Array:
-        return np.maximum(symmetric_eigenvalues(later.gram_at(at)), 0.0)
+    def parts() -> Iterator[Trajectory]:
+        for part in regression.gram_parts():
+            at = part.mesh.edges[1:], part.values[:, -1]
+            ends.append(_told(regression, settings.rho, tol, *at))
+            yield part
+
+    # Of parameters that move one pass of filters serves all of the times.
+    first = regression.gram_with_rounding(t, parts()) if regression.dynamics else None
+    seen = cache(lambda: first or later.gram_with_rounding(t))
+    end = (
+        (first[0][-1:], np.zeros((1, regression.p))) if first
+        else regression.gram_with_rounding(t[-1:])
+    )
+
+    def eigenvalues(gram: Array) -> Array:
+        return np.maximum(symmetric_eigenvalues(gram), 0.0)
 
     return Excitation(
-        t, window, settings.rho, regression.parameters, known_at(regression, t[-1:], tol),
-        t_c=partial(_t_c, later, settings.rho, tol),
-        lambda_min=lambda: float(eigenvalues(t[-1:])[0, 0]) if later.p else 0.0,
-        known=partial(known_at, later, t, tol), gram_eigenvalues=partial(eigenvalues, t),
+        t, window, settings.rho, regression.parameters, _known(regression, t[-1:], tol, end),
+        t_c=partial(_t_c, later, settings.rho, tol, ends),
+        lambda_min=lambda: float(eigenvalues(end[0])[0, 0]) if later.p else 0.0,
+        known=lambda: _known(later, t, tol, seen()),
+        gram_eigenvalues=lambda: eigenvalues(seen()[0]),
         pe_level=lambda: window_level(
             ((part.outer for part in segment.windows()) for segment in later.segments), t, window,
             later.resets,
@@ -122,7 +137,14 @@ def assess(
 
 def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
     """What is known at some times (N,) from ψ, resolved to ``tol``."""
-    gram, rounding = regression.gram_with_rounding(at)
+    return _known(regression, at, tol, regression.gram_with_rounding(at))
+
+
+def _known(
+    regression: LinearRegression, at: Array, tol: float, seen: tuple[Array, Array]
+) -> Knowledge:
+    """:func:`known_at` from [G | h] with its rounding there."""
+    gram, rounding = seen
     rounding = rounding + regression.rounding_of(gram)
     return knowledge(gram, *_beside(regression, at), tol, rounding)
 
@@ -132,20 +154,29 @@ def _beside(regression: LinearRegression, at: Array) -> tuple[Array, Array]:
     return regression.terms(at), at - regression.mesh.edges[0]
 
 
-def _t_c(regression: LinearRegression, rho: float | None, tol: float) -> float | None:
-    """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``."""
-    def seen(at: Array, matrices: Array, rounding: Array) -> tuple[Array, Array]:
-        """How well all are told apart, or λ_min over ρ, and what of that may be rounding."""
-        rounding = rounding + regression.rounding_of(matrices)
-        if rho is not None:
-            level = rounding.max(axis=1, initial=_TINY)
-            return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
-        known = knowledge(matrices, *_beside(regression, at), tol, rounding)
-        return known.smallest, known.rounding
+def _told(
+    regression: LinearRegression, rho: float | None, tol: float, at: Array, matrices: Array,
+    rounding: Array | float = 0.0,
+) -> tuple[Array, Array]:
+    """How well all are told apart, or λ_min over ρ, and what of that may be rounding, (M,) each."""
+    rounding = rounding + regression.rounding_of(matrices)
+    if rho is not None:
+        level = rounding.max(axis=1, initial=_TINY)
+        return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
+    known = knowledge(matrices, *_beside(regression, at), tol, rounding)
+    return known.smallest, known.rounding
 
+
+def _t_c(
+    regression: LinearRegression, rho: float | None, tol: float, ends: list[tuple[Array, Array]],
+) -> float | None:
+    """First time at which all parameters can be told apart, or at which λ_min(G) is ``rho``.
+
+    What is :func:`_told` at the right ends of elements is in ``ends``, part by part, or nothing.
+    """
+    seen = partial(_told, regression, rho, tol)
     smallest, level = (np.concatenate(each) for each in zip(*(
-        seen(part.mesh.edges[1:], part.values[:, -1], np.zeros((part.mesh.size, regression.p)))
-        for part in regression.gram_parts()
+        ends or (seen(part.mesh.edges[1:], part.values[:, -1]) for part in regression.gram_parts())
     ), strict=True))
     # Early on G is rounding beside what it becomes: t_c is when parameters are told apart well,
     # or half as well as they ever are.

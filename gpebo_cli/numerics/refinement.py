@@ -105,13 +105,13 @@ def resolve(
     """Resolve signals that are known: nothing is integrated.
 
     ``evaluate`` gives what is wanted on a mesh, and the signals (K, s + 1, c) to resolve, each kind
-    with its floor (see :func:`unresolved_kinds`); the rest is as of :func:`refine`. The result is
-    the mesh, what is wanted on it, and the largest tail.
+    with its floor (see :func:`unresolved_kinds`), perhaps with elements in front; the rest is as of
+    :func:`refine`. The result is the mesh, what is wanted on it, and the largest tail.
     """
 
     def on(mesh: Mesh, before: Found | None, kept: IntArray) -> tuple[Found, Array]:  # noqa: ARG001
         found, kinds = evaluate(mesh)
-        return found, unresolved_kinds(kinds, mesh.rule)
+        return found, unresolved_kinds(kinds, mesh.rule)[-mesh.size :]
 
     mesh, found, tail = refine(on, mesh, tol=tol, max_elements=max_elements, name=name)
     return mesh, found, float(tail.max(initial=0.0))

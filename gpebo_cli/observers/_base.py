@@ -94,10 +94,11 @@ class Measurements:
         arguments = None if system is None else switching(system.coefficients)
         return seen(on_their_side(arguments, t, inside, seen), inside)
 
-    def check_memory(self, system: DescriptorSystem, times: float = 1.0) -> None:
+    def check_memory(self, system: DescriptorSystem, times: float = 1.0, more: int = 0) -> None:
         """Refuse a recording whose samples make more than memory holds (ConfigError).
 
-        An observer may hold so many ``times`` what a regression and a state map take.
+        An observer may hold so many ``times`` what a regression and a state map take, or so many
+        ``more`` numbers at each point.
         """
         if self.wanted is None:
             return
@@ -107,11 +108,11 @@ class Measurements:
         elements, points = np.sum([(self.mesh.size, self.mesh.points.size), *self.beside], axis=0)
         numbers = times * _HELD * (p + 1) * (n + p + signals) * points
         if self.asked is not None and times == 1.0:
-            # Y, ψ and the signals at all points, and the state map at samples; of several
-            # recordings each one's and all together.
+            # Y, ψ, the signals and what is more at all points, and the state map at samples; of
+            # several recordings each one's and all together.
             widths = {p, p + rank * len(self.beside)}
             numbers = _KEPT * sum(
-                points * ((n - rank + system.r) * (own + 1) + signals + 2)
+                points * ((n - rank + system.r) * (own + 1) + signals + 2 + more)
                 + elements * ((n + 1) * (own + 2) + signals + _BESIDE) for own in widths
             )
         check_memory(

@@ -20,6 +20,7 @@ from gpebo_cli.observers.reduced.condensed import lean
 from gpebo_cli.observers.reduced.sampled import SampledObserver, sampled_observer
 from gpebo_cli.observers.reduced.system import SMALL, reduced_system
 from gpebo_cli.observers.remedies import REMEDIES, Remedy
+from gpebo_cli.observers.remedies.current_coordinates import CurrentCoordinates
 from gpebo_cli.observers.remedies.output_injection import OutputInjection
 from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.recordings.hold import Hold
@@ -89,7 +90,8 @@ class Gpebo:
     ) -> Observation:
         """The regression and the state map, with the remedy."""
         keeps = isinstance(self.remedy, Plain | OutputInjection)
-        if not keeps or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
+        lasts = keeps or isinstance(self.remedy, CurrentCoordinates)
+        if not lasts or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
         if not keeps:
             return self._observe(system, signals, solver)

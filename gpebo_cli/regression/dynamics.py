@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from math import gamma, pi, sqrt
 
 import numpy as np
 
@@ -15,13 +16,16 @@ from gpebo_cli.numerics.collocation import merged, solve
 from gpebo_cli.numerics.linalg import largest_over_time, transpose
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, joined, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.numerics.refinement import refine
+from gpebo_cli.regression.resets import ExtensionState, Known
 
 TOLERANCE = 1e-12
 _MAX_ELEMENTS = 200_000
 _ADVICE = "use another observer.remedy, or a shorter time.horizon"
 _LEVELS, _BESIDE_TIES = 96, 0.1234  # of ρ, a decade; none of them is at a round number
 _SHORT = 0.01  # of a decay's own time
+_STAGES = 7  # up to which more of them are cheaper than more elements
 _GROWTH = 1e3  # within an element: as many digits are lost
 
 
@@ -29,16 +33,22 @@ _GROWTH = 1e3  # within an element: as many digits are lost
 class Dynamics:
     """𝔸 and 𝕓 on one mesh."""
 
-    A: Trajectory  # (p, p)
-    b: Trajectory  # (p,)
+    rows: Trajectory  # (k, p + 1) the last rows of [𝔸 | 𝕓]; above them are zeros
     units: Array  # (p,) in which parameters are comparable
 
+    def at(self, t: Array, inside: Array) -> tuple[Array, Array]:
+        """𝔸 (N, p, p) and 𝕓 (N, p) at the times t (N,)."""
+        rows = self.rows(t, inside)
+        still = rows.shape[2] - 1 - rows.shape[1]
+        whole = np.pad(rows, ((0, 0), (still, 0), (0, 0)))
+        return whole[..., :-1], whole[..., -1]
+
     @cached_property
-    def turn(self) -> Trajectory:
-        """[𝔸 | 𝕓] of comparable parameters, (p, p + 1)."""
-        A, b = self.A.values, self.b.values
-        whole = [A * self.units / self.units[:, None], (b / self.units)[..., None]]
-        return Trajectory(self.A.mesh, np.concatenate(whole, axis=3))
+    def growth(self) -> float:
+        """By which power of e parameters may grow, ∫ of the largest real part or 0."""
+        mesh, values = self.rows.mesh, self.rows.values
+        rates = fastest(values.reshape(mesh.points.size, *values.shape[2:]))[1]
+        return float(mesh.trajectory(rates).integral().final)
 
     @cached_property
     def forgetting(self) -> tuple[Array, Array]:
@@ -47,31 +57,44 @@ class Dynamics:
         ρ/2 is the next of 96 rates a decade above the fastest decay of 𝔸 at any time so far. A
         decay that has gone on for less than 0.01 of its own time does not count.
         """
-        p, start = self.turn.values.shape[2], self.turn.mesh.span[0]
+        mesh, values = self.rows.mesh, self.rows.values
+        start = mesh.span[0]
 
-        def needed(t: Array, A: Array) -> Array:
-            rate = -np.linalg.eigvals(A[..., :p]).real.min(axis=-1)
+        def needed(t: Array, rows: Array) -> Array:
+            rate = fastest(rows)[0]
             some = rate * (t - start) > _SHORT
             level = np.ceil(_LEVELS * np.log10(np.where(some, rate, 1.0)) - _BESIDE_TIES)
             return np.where(some, level, -np.inf)
 
-        t = self.turn.mesh.points.ravel()
-        found = needed(t, self.turn.values.reshape(-1, *self.turn.values.shape[2:]))
+        t = mesh.points.ravel()
+        found = needed(t, values.reshape(t.size, *values.shape[2:]))
         levels, times = [-np.inf], list[float]()
         for k in np.flatnonzero(np.diff(np.maximum.accumulate(found)) > 0.0):
             while levels[-1] < found[k + 1]:
                 at = halved(
-                    lambda t: np.where(needed(t, self.turn(t)) > levels[-1], 1.0, -1.0),
+                    lambda t: np.where(needed(t, self.rows(t)) > levels[-1], 1.0, -1.0),
                     np.array([-1.0]), t[k : k + 1], t[k + 1 : k + 2],
                 )
-                there = float(needed(at, self.turn(at))[0])
+                there = float(needed(at, self.rows(at))[0])
                 times.append(float(at[0]))
                 levels.append(there if there > levels[-1] else float(found[k + 1]))
         return np.array(times), 2.0 * 10.0 ** ((np.array(levels) + _BESIDE_TIES) / _LEVELS)
 
 
+def fastest(rows: Array) -> tuple[Array, Array]:
+    """Rates of the fastest decay and growth, (N,) each, or 0, of the last rows (N, k, p + 1).
+
+    They are found where a matrix differs from the one before it.
+    """
+    A = rows[..., -1 - rows.shape[1] : -1]
+    fresh = np.append(True, (A[1:] != A[:-1]).any(axis=(1, 2)))
+    real = np.linalg.eigvals(A[fresh]).real
+    which = fresh.cumsum() - 1
+    return -real.min(axis=1, initial=0.0)[which], real.max(axis=1, initial=0.0)[which]
+
+
 def filtered(
-    outer: Trajectory, rates: Array, gains: Array, dynamics: Dynamics, start: Array | None = None
+    outer: Trajectory, rates: Array, gains: Array, dynamics: Dynamics, known: Known = ()
 ) -> Trajectory:
     """[Ω | 𝒴] (p, p + 1) with Ω η = 𝒴 at every time, for η that moves.
 
@@ -80,30 +103,50 @@ def filtered(
     Nothing in it grows as solutions of η' = 𝔸η do; in directions that decay, Ω would grow as the
     square of their inverse, which the forgetting ρ(t) makes up for, twice the rate of the fastest
     decay so far. ``outer`` is [ψᵀψ | ψᵀy] (p, p + 1), and Λ and Γ have the diagonals ``rates`` and
-    ``gains`` (p,).
+    ``gains`` (p,). It goes on from what is ``known``, see :func:`state_of`, or starts at zero.
     """
     p, units = outer.values.shape[2], dynamics.units
     # It is solved for comparable parameters: what is small in its unit only is no rounding.
     own = units[:, None] * np.append(units, 1.0)
     outer = Trajectory(outer.mesh, own * outer.values)
-    known, sizes = np.zeros((p, p + 1)) if start is None else own * start, np.zeros((p, p + 1))
-    pieces, turn, (times, levels) = list[Trajectory](), dynamics.turn, dynamics.forgetting
+    start, sizes = np.zeros((2, p, p + 1))
+    if known:
+        start, sizes = own * known[0].values, own * known[0].level
+    pieces, (times, levels) = list[Trajectory](), dynamics.forgetting
+    rule = _rule(outer.mesh, float(rates.max(initial=0.0) + levels[-1]))
 
     def moving(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         """Λ + ρI + 𝔸ᵀ and 𝔸 (N, p, p), and 𝕓 (N, p)."""
-        at, rho = turn(t, inside), levels[np.searchsorted(times, inside)]
-        A = at[..., :p]
-        return transpose(A) + (rates + rho[:, None])[:, None] * np.eye(p), A, at[..., p]
+        (A, b), rho = dynamics.at(t, inside), levels[np.searchsorted(times, inside)]
+        A = A * units / units[:, None]
+        return transpose(A) + (rates + rho[:, None])[:, None] * np.eye(p), A, b / units
 
     for window in outer.mesh.windows():
         within = times[(times > window.span[0]) & (times < window.span[1])]
-        finer = Mesh(with_others(window.edges, within), window.rule)
-        arguments = finer, outer, gains, moving, known, sizes
+        finer = Mesh(with_others(window.edges, within), rule)
+        arguments = finer, outer, gains, moving, start, sizes
         pieces.append(_carried(*arguments) or _over(*arguments))
-        known = pieces[-1].final
+        start = pieces[-1].final
         sizes = np.maximum(sizes, largest_over_time(pieces[-1].values, 2))
     found = joined(pieces)
     return Trajectory(found.mesh, found.values / own)
+
+
+def _rule(mesh: Mesh, rate: float) -> RadauRule:
+    """That of a mesh, or one of more stages, which e^{−rate t} needs in the usual element.
+
+    Its Legendre coefficients are √π xⁿ/Γ(n + ½), x = rate h/4. Cuts would make more points.
+    """
+    x, stages = 0.25 * rate * float(np.median(mesh.steps)), mesh.rule.stages
+    while stages < _STAGES and sqrt(pi) * x ** (stages + 1) > TOLERANCE * gamma(stages + 1.5):
+        stages += 1
+    return radau_rule(stages)
+
+
+def state_of(extended: Trajectory, known: Known) -> ExtensionState:
+    """From what :func:`filtered` goes on after [Ω | 𝒴] (p, p + 1), made of what was ``known``."""
+    sizes = largest_over_time(extended.values, 2)
+    return ExtensionState(extended.final, np.maximum(sizes, known[0].level) if known else sizes)
 
 
 def _carried(
@@ -140,7 +183,7 @@ def _carried(
         weights = h[:, None, None] * rule.integration
         added = (weights @ added.reshape(count, rule.stages, -1)).reshape(added.shape)
         back, forth = np.asarray(np.linalg.inv(W)), np.asarray(np.linalg.inv(N))
-        largest = [np.abs(each).max(axis=(1, 2, 3)) for each in (W, N, back, forth)]
+        largest = [np.abs(x).max(axis=(1, 2, 3), initial=0.0) for x in (W, N, back, forth)]
         return [back, added, forth, np.stack(largest, axis=1)]
 
     def evaluate(
@@ -157,7 +200,8 @@ def _carried(
         kinds = []
         for part in (np.s_[..., :p], np.s_[..., p:]):
             signal = values[part].reshape(*values.shape[:2], -1)
-            kinds.append((signal, np.maximum(sizes[part].ravel(), SHARE * np.abs(signal).max())))
+            least = SHARE * np.abs(signal).max(initial=0.0)
+            kinds.append((signal, np.maximum(sizes[part].ravel(), least)))
         return (parts, values), unresolved_kinds(kinds, rule)
 
     first = maps(mesh, np.ones(mesh.size, dtype=bool))

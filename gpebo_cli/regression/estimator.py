@@ -45,21 +45,30 @@ class Unmixed:
         """There is no Δ at any of the times t (M,)."""
 
 
+class Lasting:
+    """Estimates that know what was got before them."""
+
+    def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:  # noqa: ARG002
+        """What the last of the ``parts`` says."""
+        return deque(parts, maxlen=1)[0].requirement
+
+
 @dataclass(frozen=True, eq=False)
-class Found:
+class Found(Lasting):
     """Estimates of every case that are at hand, with what was mixed."""
 
     values: Array  # (cases, M, p)
     requirement: Requirement
     mixed: Array | None = None  # Δ (1 or cases, k); None: nothing is mixed
     shown: Array = field(default_factory=lambda: np.zeros(0))  # (k,) the times of that
+    reached: tuple[ExtensionState, ...] = ()  # of each case, where a window of them is found
 
     def delta(self, t: Array) -> Array | None:
         """Δ (1 or cases, j) at some of the times that were to be shown, (j,)."""
         return None if self.mixed is None else self.mixed[:, np.searchsorted(self.shown, t)]
 
-    def parameters(self, cases: slice) -> Array:
-        """η̂ of some cases, (g, M, p)."""
+    def parameters(self, cases: slice, start: Array | None = None) -> Array:  # noqa: ARG002
+        """η̂ of some cases, (g, M, p), wherever they ``start``."""
         return self.values[cases]
 
 
@@ -94,14 +103,6 @@ class WindowEstimates(ResumableEstimates, Protocol):
 
     def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:
         """What is needed and was got in all of the ``parts`` of a span, this the first of them."""
-
-
-class Lasting:
-    """Estimates that know what was got before them."""
-
-    def over(self, parts: Iterable[WindowEstimates], span: tuple[float, float]) -> Requirement:  # noqa: ARG002
-        """What the last of the ``parts`` says."""
-        return deque(parts, maxlen=1)[0].requirement
 
 
 @runtime_checkable
@@ -139,9 +140,12 @@ class Moving(Protocol):
     """An estimator that can follow parameters that move."""
 
     def estimate_moving(
-        self, regression: LinearRegression, dynamics: Dynamics, t: Array
-    ) -> Estimates:
-        """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending."""
+        self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
+    ) -> WindowEstimates:
+        """Prepare the estimates of η' = 𝔸η + 𝕓 from Y = ψη at the times t (M,), ascending.
+
+        From what was ``reached`` in the window before; none: it is the first one.
+        """
 
 
 @runtime_checkable

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
+from math import prod
 
 import numpy as np
 
@@ -14,9 +16,9 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered
+from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered, state_of
 from gpebo_cli.regression.parametrisation import Parametrisation
-from gpebo_cli.regression.resets import ExtensionState, Reset, level_of
+from gpebo_cli.regression.resets import ExtensionState, Known, Reset, level_of
 
 _MANY = 16  # parameters, from which on G at the end is made without those at all other points
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
@@ -93,8 +95,7 @@ class LinearRegression:
         known.
         """
         if self.dynamics is not None:
-            ones = np.ones(self.p)
-            return filtered(self.outer, 0.0 * ones, ones, self.dynamics)
+            return self._moving(self.dynamics, ())
         if not self.resets:
             held = self.p < _MANY or "outer" in vars(self)
             return (self if held else replace(self)).outer.integral()
@@ -109,46 +110,63 @@ class LinearRegression:
         return Trajectory(self.mesh, np.concatenate(pieces))
 
     def gram_parts(self) -> Iterator[Trajectory]:
-        """[G | h] one window after the other, so that little of it is held."""
-        known: Array | float = 0.0
+        """[G | h] one window after the other, so that little of it is held.
+
+        Who comes to the end has found ``gram_final`` (SolverError: squares are too large for
+        numbers).
+        """
+        known, state = np.zeros((self.p, 1)), list[ExtensionState]()
         for window in self.windows():
-            part = window.gram
-            if window is not self:  # what it holds is its own
+            if window is self:
+                part = self.gram
+            elif window.dynamics is not None:
+                part = window._moving(window.dynamics, state)  # noqa: SLF001
+                state = [state_of(part, state)]
+            else:
+                part = window.gram  # what it holds is its own
                 np.add(part.values, known, out=part.values)
                 known = part.final
-            yield part
-
-    @cached_property
-    def gram_final(self) -> Array:
-        """[G | h] at the end, (p, p + c) (SolverError: squares are too large for numbers)."""
-        if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
-            rows = (window._weighted() for window in self.windows())  # noqa: SLF001
-            return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
-        for part in self.gram_parts():
-            known = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
-            if not known.all():
-                t = part.mesh.edges[np.argmin(known)]
+            finite = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
+            if not finite.all():
+                t = part.mesh.edges[np.argmin(finite)]
                 raise SolverError(
                     f"∫ψᵀψ is too large for a number near t = {t:.4g}; write Y and ψ in larger "
                     "units"
                 )
-        return part.final
+            yield part
+        vars(self).setdefault("gram_final", part.final)
+
+    def _moving(self, dynamics: Dynamics, known: Known) -> Trajectory:
+        """[G | h] of parameters that move, from what was ``known`` before."""
+        ones = np.ones(self.p)
+        return filtered(self.outer, 0.0 * ones, ones, dynamics, known)
+
+    @cached_property
+    def gram_final(self) -> Array:
+        """[G | h] at the end, (p, p + c) (SolverError: as of :meth:`gram_parts`)."""
+        if self.p >= _MANY and not (self.resets or self.dynamics or "gram" in vars(self)):
+            rows = (window._weighted() for window in self.windows())  # noqa: SLF001
+            return np.asarray(sum(own[:, : self.p].T @ own for own in rows))
+        return deque(self.gram_parts(), maxlen=1)[0].final
 
     def gram_at(self, t: Array) -> Array:
         """[G | h] at the times t (M,), (M, p, p + c)."""
         return self.gram_with_rounding(t)[0]
 
-    def gram_with_rounding(self, t: Array) -> tuple[Array, Array]:
+    def gram_with_rounding(
+        self, t: Array, parts: Iterable[Trajectory] | None = None
+    ) -> tuple[Array, Array]:
         """The same, and how wrong rounding may make the diagonal of G, (M, p).
 
         Early in an element, G is interpolated from what it grows to, and takes part in the rounding
-        of that.
+        of that. The ``parts`` are those of :meth:`gram_parts`, for who looks at them, too.
         """
         start, stop = self.mesh.span
-        if (t == stop).all():
+        if parts is None and (t == stop).all():
             return np.repeat(self.gram_final[None], len(t), axis=0), np.zeros((len(t), self.p))
-        found, rounding = np.empty((len(t), *self.gram_final.shape)), np.empty((len(t), self.p))
-        for part in self.gram_parts():
+        columns = self.p + prod(self.realisations)
+        found, rounding = np.empty((len(t), self.p, columns)), np.empty((len(t), self.p))
+        for part in self.gram_parts() if parts is None else parts:
             mesh, (first, last) = part.mesh, part.mesh.span
             some = ((t >= first) | (first == start)) & ((t < last) | (last == stop))
             if some.any():
@@ -226,7 +244,7 @@ class LinearRegression:
     @property
     def long(self) -> bool:
         """Whether there are several windows."""
-        plain = not (self.resets or self.dynamics or self.realisations)
+        plain = not (self.resets or self.realisations)
         return plain and self.mesh.size > _WINDOW
 
     @property

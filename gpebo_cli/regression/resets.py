@@ -37,7 +37,8 @@ class ExtensionState:
     """What is known of η at one time: Ω η = 𝒴, and how much of it is new."""
 
     values: Array  # [Ω | 𝒴] (p, p + 1)
-    level: Array | float  # (p,) the diagonal of Ω from one segment's data alone, the largest so far
+    # (p,) the diagonal of Ω from one segment's data alone, the largest so far; where parameters
+    level: Array | float  # move, the largest of all of [Ω | 𝒴] so far, (p, p + 1)
     memory: float = 1.0  # z of least squares with forgetting
     surplus: float = SURPLUS  # how many times ``level`` a reset may make of Ω
     energy: float = 0.0  # ∫Δ² of a law behind it since it began

@@ -16,7 +16,7 @@ from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Kind, Mesh, Samples, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.observers._base import largest_entry, log_norm
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMatrices, weakest
@@ -200,33 +200,32 @@ def _over(
 
 def joined(parts: Iterable[Extension]) -> Extension:
     """One extension of those on neighbouring meshes."""
-    pieces, rest = dict[str, list[Array]](), list[tuple[Any, ...]]()
+    over_time, rest = dict[str, Any](), list[tuple[Any, ...]]()
     for part in parts:
         found = part.assembled
         for name, piece in (
-            ("edges", part.mesh.edges[:-1]), ("scale", part.scale), ("z", part.trajectory.values),
+            ("edges", part.mesh.edges[1:]), ("scale", part.scale), ("z", part.trajectory.values),
             ("asked", part.asked), *((name, getattr(found, name)) for name in OVER_TIME),
         ):
-            pieces.setdefault(name, []).append(piece)
+            if piece is not None:
+                whole = over_time.setdefault(name, np.empty((0, *piece.shape[1:])))
+                held = len(whole)
+                # In place: pieces beside the whole would be as much again.
+                whole.resize((held + len(piece), *piece.shape[1:]), refcheck=False)
+                whole[held:] = piece
         rest.append((part.error_estimate, part.weakest, found.Y_scale, found.column_scale,
-                     found.largest, found.moving))
-    pieces["edges"].append(part.mesh.edges[-1:])
-    errors, weak, of_Y, of_columns, largest, moving = zip(*rest, strict=True)
-    if part.asked is None:
-        del pieces["asked"]
-    # One after the other, so that little of it is held twice.
-    over_time: dict[str, Any] = {name: np.concatenate(pieces.pop(name)) for name in [*pieces]}
-    mesh = Mesh(over_time.pop("edges"), part.mesh.rule)
+                     found.largest, found.moving, part.mesh.edges[0]))
+    errors, weak, of_Y, of_columns, largest, moving, starts = zip(*rest, strict=True)
+    mesh = Mesh(np.append(starts[0], over_time.pop("edges")), part.mesh.rule)
     z, scale, asked = over_time.pop("z"), over_time.pop("scale"), over_time.pop("asked", None)
     return Extension(
-        Trajectory(mesh, z) if asked is None else mesh.sampled(
-            np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]])
-        ), max(errors),
+        mesh.sampled(np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]]))
+        if isinstance(part.trajectory, Samples) else Trajectory(mesh, z), max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
-        np.maximum.accumulate(scale, axis=0), part.units, min(weak), asked,
+        np.maximum.accumulate(scale, axis=0, out=scale), part.units, min(weak), asked,
     )
 
 

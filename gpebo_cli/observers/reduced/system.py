@@ -28,7 +28,7 @@ from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.schema import nearest, shown
 from gpebo_cli.settings import SolverSettings
 
-_MATRICES = frozenset("EABFCDH")
+_MADE_OF = frozenset({*"EABFCDH", "phi"})  # what the observer's matrices are made of
 AT_ONCE = 1 << 15  # points: what is made of all of them at once is what takes the memory
 SMALL = 8  # coordinates of w, up to which dense collocation is faster
 
@@ -140,7 +140,8 @@ class ReducedSystem(Formulation):
 
     @cached_property
     def _constant(self) -> ObserverMatrices | None:
-        if self.form.follows_signals or _MATRICES - self.system.coefficients.constant:
+        held = self.form.held  # as the first ones are
+        if not held or self.form.follows_signals or _MADE_OF - self.system.coefficients.constant:
             return None
         return self.first.at_first
 

@@ -13,7 +13,11 @@ coordinates, V = I, and Q w = 0 is measured, too.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import repeat
+from math import prod
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,11 +25,17 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
+from gpebo_cli.observers.reduced.extension import Extension, joined
 from gpebo_cli.observers.reduced.matrices import weakest
 from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
 from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
+
+# Times and where jumps are decided, (2, K, s + 1); the rest at these; what the mesh has to resolve.
+_Evaluated: TypeAlias = tuple[
+    Array, Assembled, Array, tuple[float, float], list[tuple[Array, float]]
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,55 +70,77 @@ class CurrentCoordinates:
         # [ξ_a | ξ_b | Φ] = [0 | 0 | −I] is the identity map from ζ to w.
         identity = np.concatenate([np.zeros((k, 1 + q)), -np.eye(k)], axis=1)
         p = q + k
+        reduced.signals.check_memory(system, more=k * (p + 1))
         units = np.concatenate([reduced.form.units.unknowns, reduced.units])
         start = reduced.first.at_first
         size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
+        past = np.zeros((2, 0, len(reduced.mesh.rule.points)))
 
-        def evaluate(
-            mesh: Mesh
-        ) -> tuple[tuple[Assembled, Array, Array, tuple[Array, Array]], list[tuple[Array, float]]]:
-            t, inside = mesh.points.ravel(), mesh.inside.ravel()
+        def evaluate(mesh: Mesh) -> tuple[_Evaluated, list[tuple[Array, float]]]:
+            times = np.concatenate([past, [mesh.points, mesh.inside]], axis=1)
+            t, inside = times.reshape(2, -1)
             o = reduced.matrices(t, inside)
             signals = reduced.measured(t, inside)
-            A, b = np.zeros((len(t), p, p)), np.zeros((len(t), p))
-            A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics
-            b[:, q:] = (o.from_signals @ signals)[:, :, 0]
+            rows = np.empty((len(t), k, p + 1))
+            rows[..., :q], rows[..., q:p] = o.from_unknowns, o.dynamics
+            rows[..., p] = (o.from_signals @ signals)[:, :, 0]
             z = np.broadcast_to(identity, (len(t), *identity.shape))
             a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 # Further rows 0 = Q w, of the size of ψ.
                 kernel = size / reduced.units[:, None] * (np.eye(n) - o.split.projector)
-                rows = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
-                a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, rows]))
-            own = A * units / units[:, None]
-            kinds = (*a.kinds(reduced.form.units.states), (own, 0.0), (b / units, 0.0))
-            signals_of = [(v.reshape(*mesh.points.shape, -1), floor) for v, floor in kinds]
-            return (a, A, b, (o.injectivity, o.elimination)), signals_of
+                more = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
+                a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, more]))
+            own = rows * np.append(units, 1.0) / units[q:, None]
+            kinds = (*a.kinds(reduced.form.units.states), (own[..., :p], 0.0), (own[..., p], 0.0))
+            seen = [(v.reshape(*times.shape[1:], prod(v.shape[1:])), floor) for v, floor in kinds]
+            smallest, where = weakest(o.injectivity, o.elimination)
+            return (times, a, rows, (smallest, float(t[where])), seen), seen
 
-        mesh, (final, A, b, injective), error = resolve(
-            evaluate, reduced.mesh, tol=solver.tol, max_elements=solver.max_elements,
-            name=f"observer of plant {system.name}",
-        )
-        smallest, where = weakest(*injective)
+        def parts() -> Iterator[Extension]:
+            """What is made of one window after the other, [D_0 | A_0 | b_0] as its trajectory.
+
+            Those elements of windows before in which something was largest stand in front.
+            """
+            nonlocal past
+            asked, mesh = reduced.signals.asked, reduced.mesh
+            shares: Iterable[Array] = repeat(mesh.edges) if asked is None else mesh.shares(asked)
+            for window, own in zip(mesh.windows(), shares, strict=False):
+                mesh, (times, a, rows, smallest, seen), error = resolve(
+                    evaluate, window, tol=solver.tol, max_elements=solver.max_elements,
+                    name=f"observer of plant {system.name}",
+                )
+                front = past[0].size
+                part = Extension(
+                    mesh.trajectory(rows[front:]), error, a.after(front),
+                    np.broadcast_to(a.column_scale, (mesh.size, p)), reduced.units, smallest,
+                )
+                past = times[:, np.unique(np.concatenate([
+                    np.abs(v).max(axis=1).argmax(axis=0) for v, _ in seen
+                ]))]
+                yield part if asked is None else replace(
+                    part.kept_at(own), trajectory=part.trajectory
+                )
+
+        found = joined(parts())
+        mesh, final = found.mesh, found.assembled
         kept = final.kept_rows(system, reduced.regression)
         if rotates:
             kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
+        some = slice(None) if len(kept) == final.Y.shape[1] else kept  # a slice copies nothing
         return Observation(
             regression=LinearRegression(
-                Y=mesh.trajectory(final.Y[:, kept]),
-                psi=mesh.trajectory(final.psi[:, kept]),
+                Y=mesh.trajectory(final.Y[:, some]),
+                psi=mesh.trajectory(final.psi[:, some]),
                 parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
-                scale=final.column_scale,
-                dynamics=Dynamics(mesh.trajectory(A), mesh.trajectory(b), units),
+                scale=found.scale,
+                dynamics=Dynamics(found.trajectory, units),
             ),
-            state_map=AffineStateMap(
-                mesh.trajectory(final.offset), mesh.trajectory(final.gain),
-                reduced.form.units.states,
-            ),
+            state_map=AffineStateMap(*found.state_map, reduced.form.units.states),
             truth=CurrentState(reduced),
-            error_estimate=error,
-            assumptions=reduced.assumptions((smallest, float(mesh.points.ravel()[where]))),
+            error_estimate=found.error_estimate,
+            assumptions=reduced.assumptions(found.weakest),
             growth=None,
             note=reduced.note,
         )
