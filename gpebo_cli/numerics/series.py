@@ -20,12 +20,12 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import LinearSolution, at_points, decoupled, unresolved_signals
+from gpebo_cli.numerics.collocation import LinearSolution, decoupled, unresolved_signals
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
 
