@@ -117,7 +117,8 @@ def solve(
         of_each = np.full(problem.start.shape, left)
         return LinearSolution(Trajectory(mesh, values), left, of_each, None, tuple(extras))
     kept = kept_share(problem, mesh, noise, values)
-    instants = noise_of_instants(Trajectory(mesh, values), np.array(list(restarts or ())))
+    cuts = np.array(list(restarts or ()))
+    instants = noise_of_instants(problem, Trajectory(mesh, values), cuts)
     bound = EPS * through_constraints(problem, largest_over_time(values, 2))
     shown = problem.missed and problem.missed(mesh, values, bound)
     if shown is not None:

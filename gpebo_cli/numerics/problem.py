@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh
 
@@ -68,6 +70,7 @@ class LinearProblem:
     units: Array | None = None  # (n, 1)
     uncertain: Array | None = None  # (n, columns) errors of the start beside rounding
     rate: float = 0.0  # how fast X may change by itself, 1/s; zero: nobody knows
+    blur: Callable[[Array], Array] = np.abs  # how wrong instants (C,) may be, in units of rounding
     told: bool = False  # whether the monitor has all components among its signals
     advice: str = "raise solver.max_elements or solver.tol"  # where elements do not suffice
 

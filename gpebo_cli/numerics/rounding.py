@@ -106,8 +106,8 @@ def _responses(mesh: Mesh, h: Array, c: LinearEquation) -> Array:
     return np.asarray(found[:, -1].reshape(k, n, -1, d) / h[:, None, None, None])
 
 
-def noise_of_instants(solution: Trajectory, cuts: Array) -> Array:
-    """By how much relative rounding of instants (C,) moves X in the elements, (K, n, columns).
+def noise_of_instants(problem: LinearProblem, solution: Trajectory, cuts: Array) -> Array:
+    """By how much rounding of instants (C,) moves X in the elements, (K, n, columns).
 
     Between an instant and where it should be, X has the slope of the wrong side.
     """
@@ -115,5 +115,5 @@ def noise_of_instants(solution: Trajectory, cuts: Array) -> Array:
     if len(cuts):
         after, slopes = np.searchsorted(solution.mesh.edges, cuts), solution.derivative().values
         jumps = np.abs(slopes[after, 0] - slopes[after - 1, -1])
-        found[after] = np.abs(cuts)[:, None, None] * jumps
+        found[after] = problem.blur(cuts)[:, None, None] * jumps
     return found

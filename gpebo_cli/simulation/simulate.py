@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
-from gpebo_cli.model.text import FollowsSignals
+from gpebo_cli.model.text import FollowsSignals, blur_of
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -169,7 +169,7 @@ def _solved(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
         _amplification(first, structure.scaling.columns, within),
         units=units, missed=partial(_missed, system, structure, within) if structure.a else None,
-        rate=structure.rate,
+        rate=structure.rate, blur=partial(blur_of, system.coefficients),
     )
     if independent:
         problem = replace(problem, coefficients=explicit)
