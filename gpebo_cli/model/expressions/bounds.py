@@ -333,7 +333,7 @@ def blurred(tape: Tape, t: Array) -> Array:
         share = _WIDTH * (most - least) / np.abs(arguments.taylor(t, _MULTIPLE, t)[1:])
     within = (share ** (1.0 / orders[:, None, None])).min(axis=0)
     vanishes = (least <= 0.0) & (most >= 0.0) & np.isfinite(within)
-    return np.where(vanishes, within, 0.0).max(axis=1)
+    return np.asarray(np.where(vanishes, within, 0.0).max(axis=1))
 
 
 def switched(arguments: Tape, t: Array, signals: Callable[[Array, int], Array]) -> Array:
