@@ -31,6 +31,7 @@ END = 8.0  # units in the last place of what an end value is made of, lost in so
 VALUE = 32.0  # likewise of any value, which are not carried on
 ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
+_SHOWN = 8.0  # times the noise of coefficients: the most that rounding of constraints may be
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
 _FEW = 1e-3  # of a component: beyond that an error leaves less than three digits
@@ -123,7 +124,8 @@ def judged_errors(
     and of what right ends are made of.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        through = through_constraints(problem, own)
+        seen = np.maximum(problem.seen, _SHOWN * noise / EPS)
+        through = np.minimum(through_constraints(problem, own), seen)
         total = largest + tail + noise + EPS * (VALUE * own + through)
         if problem.units is None:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
@@ -173,5 +175,4 @@ def through_constraints(problem: LinearProblem, sizes: Array) -> Array:
     if problem.amplification is None:
         return np.zeros_like(sizes)
     sizes = np.maximum(sizes, problem.floor)
-    through = problem.amplification[:, :-1] @ sizes + problem.amplification[:, -1:]
-    return np.minimum(through, problem.seen)
+    return np.asarray(problem.amplification[:, :-1] @ sizes + problem.amplification[:, -1:])
