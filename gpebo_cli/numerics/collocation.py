@@ -244,9 +244,10 @@ def _element_maps(
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
-        c = known
-        if c is None or len(h) > chunk:
+        if known is None:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
+        else:
+            c = known.of(part, s + 1)
         maps = _solve_elements(problem, mesh, h[part], t[part], c)
         if len(h) <= chunk:
             return maps

@@ -33,6 +33,19 @@ class LinearEquation(NamedTuple):
     # (K or 1, d, n + columns or 1) what [A f] are the difference of, at the end of each element
     terms: Array | None = None
 
+    def of(self, elements: slice, points: int) -> LinearEquation:
+        """This at those of the elements, of which each has so many points."""
+        every = slice(points * elements.start, points * elements.stop)
+
+        def some(values: Any, which: slice = every) -> Any:
+            return values if values is None or len(values) == 1 else values[which]
+
+        return LinearEquation(
+            some(self.E), some(self.A), some(self.f), tuple(map(some, self.extras)),
+            self.constraints and Constraints(*map(some, self.constraints)),
+            some(self.terms, elements),
+        )
+
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
 Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Any, float | Array]]]
