@@ -63,11 +63,14 @@ def _of_terms(h: Array, t: Array, c: LinearEquation) -> Array:
 
 
 def kept_share(problem: LinearProblem, mesh: Mesh, noise: Array, values: Array) -> Array:
-    """Which share (K, n, 1) of :func:`noise_of` is left at right ends, values being (K, s + 1, …).
+    """Which share (K or 1, ·, 1) of :func:`noise_of` is left where values (K, s + 1, …) end.
 
     It is looked at where that is much and equations are fast. Rounding of one term knows nothing of
     another's, nor at one node of that at the next; where A is constant, it is the same at all.
     """
+    fast = mesh.steps * problem.rate > _FAST
+    if not fast.any():
+        return np.ones((1, 1, 1))
     sizes, share = largest_within(values), np.ones((mesh.size, values.shape[2], 1))
 
     def moved(noise: Array, sizes: Array) -> Array:
@@ -76,15 +79,16 @@ def kept_share(problem: LinearProblem, mesh: Mesh, noise: Array, values: Array) 
         return np.asarray(noise[..., :n] @ sizes + apart.sum(axis=2))
 
     most = moved(noise, sizes)
-    much = (most > _MUCH * sizes.max(axis=0)).any(axis=(1, 2))
-    much = np.flatnonzero(much & (mesh.steps * problem.rate > _FAST))
+    much = np.flatnonzero((most > _MUCH * sizes.max(axis=0)).any(axis=(1, 2)) & fast)
     for k in range(0, len(much), _AT_ONCE):
         some = much[k : k + _AT_ONCE]
         h, t = mesh.steps[some], mesh.points[some]
         c = problem.coefficients(t.ravel(), mesh.inside[some].ravel())
-        squares = np.square(_responses(mesh, h, c)).mean(axis=2)
-        left = np.sqrt(squares @ moved(np.square(_of_terms(h, t, c)), np.square(sizes[some])))
-        part = left / np.maximum(most[some], _TINY)
+        squares, terms = np.square(_responses(mesh, h, c)).mean(axis=2), _of_terms(h, t, c)
+        unit = max(float(sizes[some].max()), _TINY)  # squares of what grows are no numbers
+        terms[..., values.shape[2] :] /= unit
+        left = np.sqrt(squares @ moved(np.square(terms), np.square(sizes[some] / unit)))
+        part = left / np.maximum(most[some] / unit, _TINY)
         share[some] = np.minimum(part, 1.0).max(axis=2, keepdims=True)
     return share
 
@@ -107,11 +111,11 @@ def _responses(mesh: Mesh, h: Array, c: LinearEquation) -> Array:
 
 
 def noise_of_instants(problem: LinearProblem, solution: Trajectory, cuts: Array) -> Array:
-    """By how much rounding of instants (C,) moves X in the elements, (K, n, columns).
+    """By how much rounding of instants (C,) moves X in the elements, (K or 1, n, columns).
 
     Between an instant and where it should be, X has the slope of the wrong side.
     """
-    found = np.zeros((solution.mesh.size, *solution.values.shape[2:]))
+    found = np.zeros((solution.mesh.size if len(cuts) else 1, *solution.values.shape[2:]))
     if len(cuts):
         after, slopes = np.searchsorted(solution.mesh.edges, cuts), solution.derivative().values
         jumps = np.abs(slopes[after, 0] - slopes[after - 1, -1])
