@@ -54,7 +54,7 @@ _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
-_BEYOND = 8.0  # times what the constraints are seen to be missed by, which counts of a bound
+_BEYOND = 5.0  # times what the constraints are seen to be missed by, which counts of a bound
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.

@@ -266,13 +266,16 @@ def _missed(
 ) -> Array | None:
     """:func:`shown_rounding` along values on a mesh, and what :func:`_within` a step brings of it.
 
-    None: its ``bound`` (n, 1) is little already, and holds where derivative arrays do.
+    None: its ``bound`` (n, 1) is little already where derivative arrays do, or nothing is seen.
     """
     if not structure.stages and (bound <= _LITTLE * largest_over_time(values, 2)).all():
         return None
     some = slice(None, None, -(-mesh.size // _LOOKED_AT))
     at = mesh.points[some, -1], mesh.inside[some, -1]
-    squares = shown_rounding(system, structure, *at, values[some, -1]) ** 2
+    try:
+        squares = shown_rounding(system, structure, *at, values[some, -1]) ** 2
+    except ModelError:
+        return None  # no rank is clear beside so much rounding
     return np.asarray(np.sqrt(squares + within**2 @ squares))
 
 
