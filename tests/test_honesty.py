@@ -53,6 +53,43 @@ def test_rounding_of_constraints_counts_where_states_swing_by_themselves():
     assert found.ratio < 3.0
 
 
+@settings(deadline=None, max_examples=15)
+@given(st.floats(4.0, 12.0), st.floats(0.5, 5.0))
+def test_what_a_fast_mode_forgets_is_no_error(decades, omega):
+    """x' = -λ (x - sin ωt) + ω cos ωt beside a slow state: the estimate was λ h roundings and more.
+
+    At 1e9 1/s it was 4e-6, a billion times the error.
+    """
+    rate = 10.0**decades
+    plant = plant_from_mapping({
+        "name": "stiff", "states": ["x", "y"], "E": [[1, 0], [0, 1]], "A": [[-rate, 0], [1, -1]],
+        "B": [[1, 0], [0, 1]], "initial_state": [0, 1], "inputs": {
+            "u": f"{rate}*sin({omega}*t) + {omega}*cos({omega}*t)",
+            "v": f"cos(t) - sin(t) - sin({omega}*t)",
+        },
+    })
+    found = simulate(plant, TimeSettings(horizon=5.0), SolverSettings(tol=TOLERANCE))
+    t = np.linspace(0, 5, 1001)
+    truth = np.stack([np.sin(omega * t), np.cos(t)], axis=1)
+    error = np.abs(found.signals.states(t) - truth).max(axis=0) / np.abs(truth).max(axis=0)
+    assert (error < found.state_errors).all()
+    assert (found.state_errors < 5e-13).all()
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.integers(0, 2**32 - 1), st.floats(4.0, 9.0))
+def test_rounding_of_constraints_beside_a_fast_mode_is_seen_and_not_bounded(seed, decades):
+    """Index 1: a tenth of the estimates were more than 3,000 times the error, some 1e9 times."""
+    rng = np.random.default_rng(seed)
+    case = made(rng, 4, 1, dynamics=np.diag([-(10.0**decades), -1.0]))
+    found = simulate(case.system, TimeSettings(horizon=case.horizon), SolverSettings(tol=TOLERANCE))
+    t = np.linspace(0, case.horizon, 1001)
+    truth = case.exact(t)
+    error = np.abs(found.signals.states(t) - truth).max(axis=0) / np.abs(truth).max(axis=0)
+    assert (error < 3.0 * found.state_errors).all()
+    assert found.error_estimate < 1e3 * error.max()
+
+
 @pytest.mark.parametrize("seed", [41, 1120])
 def test_a_rank_that_rounding_supports_is_not_taken_for_the_right_one(seed):
     """Index 4 beside a rate of 5e6: two differentiations seemed to do, with states 60 times off."""

@@ -212,6 +212,21 @@ def test_a_stiff_sparse_plant_is_as_wrong_as_it_says(build, rate, varying):
         assert wrong.max() < 1e-8
 
 
+@pytest.mark.parametrize(("n", "varying"), [(41, True), (41, False), (101, True)])
+def test_a_ladder_with_rates_over_six_decades_has_an_estimate_of_use(n, varying):
+    """It was 5e32 and more: rounding that fast modes forget was carried on through all of them."""
+    start = np.zeros(n)
+    start[1:3] = 1.0
+    system = ladders.plant(ladders.ladder(n, "stiff"), start, varying=varying)
+    found = simulate.simulate(system, TIME, SolverSettings(tol=1e-9))
+    other = simulate.simulate(system, TIME, SolverSettings(tol=1e-12, stages=10))
+    t = np.linspace(0.0, TIME.horizon, 401)
+    true = other.signals.states(t)
+    wrong = np.abs(found.signals.states(t) - true).max(axis=0) / np.abs(true).max(axis=0)
+    assert (wrong < found.state_errors + other.state_errors).all()
+    assert found.error_estimate < 1e-8
+
+
 def test_a_stiff_varying_plant_that_elimination_would_fill_is_left_to_dense_collocation():
     def full(cells):
         A = -1e5 * (np.eye(cells) + np.random.default_rng(0).uniform(0, 0.1, (cells, cells)))

@@ -20,6 +20,7 @@ from gpebo_cli.model.expressions import (
     Expression,
     Tape,
     aside,
+    blurred,
     breakpoints,
     divisors_of,
     on_their_side,
@@ -37,6 +38,7 @@ MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
 
 # Of its size before and after: a divisor that comes so near zero touches it.
 _TOUCHED = 1e-12
+_EPS = float(np.finfo(float).eps)
 _KEPT = 16  # edges of cells
 _ROUNDING = 1e-12  # of the largest time: by how much an experiment may exceed a table
 _LOOKS = np.linspace(0.0, 1.0, 9)  # of a piece, where one looks at the sign of what switches
@@ -135,12 +137,28 @@ class TextCoefficients:
             found, signals = self._tabled(t, order, inside)
             if not self.signals:
                 return found.along(signals)
-        found = Coefficients._make(self.assembly.taylor(t, order, inside, signals))
         if signals is None:
-            return found
+            return Coefficients._make(self.assembly.taylor(t, order, self._amid(inside)))
+        found = Coefficients._make(self.assembly.taylor(t, order, inside, signals))
         if self.divisors:
             self._refuse_crossings(t, inside, signals)
         return found.along(signals)
+
+    def _amid(self, inside: Array | None) -> Array | None:
+        """The times in the middle between breakpoints in place of those ``inside`` (N,).
+
+        Nothing switches between two of them, but beside one rounding of an argument might: where
+        that turns around by little more than its rounding, an element may be no longer than this.
+        """
+        if inside is None or not inside.size:
+            return inside
+        first, last = float(inside.min()), float(inside.max())
+        for (start, stop), cuts in self._breakpoints.items():
+            if len(cuts) and start <= first and last <= stop:
+                edges = np.concatenate([[start], cuts, [stop]])
+                k = np.searchsorted(cuts, inside, side="right")
+                return np.asarray(0.5 * (edges[k] + edges[k + 1]))
+        return inside
 
     def _tabled(self, t: Array, order: int, inside: Array | None) -> tuple[Coefficients, Array]:
         """What the text says without tables, and [u; 0] (order + 1, N, m + r) with them."""
@@ -194,7 +212,7 @@ class TextCoefficients:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
         if self.tables:
             return entries_of(self.taylor(t, order, inside), self.constant)
-        moving, values = self.tape.taylor(t, order, inside), []
+        moving, values = self.tape.taylor(t, order, self._amid(inside)), []
         for fixed, columns, _ in self._places:
             found = moving[:, :, columns] if columns.stop else moving[:, :1, columns]
             if len(fixed):
@@ -236,6 +254,10 @@ class TextCoefficients:
                 found = self._with_corners(found, start, stop)
             self._breakpoints[start, stop] = found
         return self._breakpoints[start, stop].copy()
+
+    def blurred(self, cuts: Array) -> Array:
+        """By how much breakpoints (C,) may be wrong beside rounding of the time, in seconds."""
+        return blurred(self.of_time.tape, cuts)
 
     def _with_corners(self, found: Array, start: float, stop: float) -> Array:
         """Breakpoints (number,) of the text with those of tables."""
@@ -320,6 +342,9 @@ class FollowsSignals(CoefficientSource, Protocol):
     def switches(self) -> Tape:
         """Arguments of sign, abs, min and max that follow outputs."""
 
+    def blurred(self, cuts: Array) -> Array:
+        """By how much breakpoints (C,) may be wrong beside rounding of the time, in seconds."""
+
     def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
         """``resolved`` for what follows signals of these numbers, from edges (K + 1,)."""
 
@@ -331,6 +356,12 @@ def switching(source: CoefficientSource) -> Tape | None:
     """Arguments of what jumps or has a kink where outputs say so, if there are any known."""
     found = source.switches if isinstance(source, FollowsSignals) else None
     return found if found is not None and found.outputs else None
+
+
+def blur_of(source: CoefficientSource, cuts: Array) -> Array:
+    """By how much breakpoints (C,) may be wrong, in units of rounding."""
+    own = source.blurred(cuts) if isinstance(source, FollowsSignals) else 0.0
+    return np.maximum(np.abs(cuts), own / _EPS)
 
 
 def coefficients_of(

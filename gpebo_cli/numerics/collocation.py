@@ -19,7 +19,7 @@ so T need not be smooth in time.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -28,8 +28,15 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.numerics.errors import CHANCE, estimated_errors, least_sizes, nothing_left
-from gpebo_cli.numerics.linalg import inverse_or_none, largest_over_time, largest_within
+from gpebo_cli.numerics.errors import (
+    CHANCE,
+    EPS,
+    estimated_errors,
+    least_sizes,
+    nothing_left,
+    through_constraints,
+)
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
     Looked,
     Mesh,
@@ -38,14 +45,16 @@ from gpebo_cli.numerics.mesh import (
     unresolved,
     unresolved_kinds,
 )
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
+from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
 
 _CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
+_BEYOND = 5.0  # times what the constraints are seen to be missed by, which counts of a bound
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
 # moment later, unless it has seen a larger array come and go. This one is never written to.
@@ -107,14 +116,18 @@ def solve(
     if problem.renewal is not None:
         of_each = np.full(problem.start.shape, left)
         return LinearSolution(Trajectory(mesh, values), left, of_each, None, tuple(extras))
-    if restarts:
-        noise = _with_instants(noise, Trajectory(mesh, values), np.array(list(restarts)))
+    kept = kept_share(problem, mesh, noise, values)
+    cuts = np.array(list(restarts or ()))
+    instants = noise_of_instants(problem, Trajectory(mesh, values), cuts)
+    bound = EPS * through_constraints(problem, largest_over_time(values, 2))
+    shown = problem.missed and problem.missed(mesh, values, bound)
+    if shown is not None:
+        problem = replace(problem, seen=_BEYOND * CHANCE * shown / EPS)
     errors = estimated_errors(
-        problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values
+        problem, mesh, homogeneous[:, -1], particular[:, -1], noise, values, kept, instants
     )
-    if problem.missed is not None:
-        shown = CHANCE * problem.missed(mesh, values)
-        errors = errors._replace(largest=np.maximum(errors.largest, shown))
+    if shown is not None:
+        errors = errors._replace(largest=np.maximum(errors.largest, CHANCE * shown))
     if left > _COARSE:
         errors = errors._replace(largest=np.maximum(errors.largest, left * errors.own))
     return LinearSolution(
@@ -231,9 +244,10 @@ def _element_maps(
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
-        c = known
-        if c is None or len(h) > chunk:
+        if known is None:
             c = problem.coefficients(t[part].ravel(), inside[part].ravel())
+        else:
+            c = known.of(part, s + 1)
         maps = _solve_elements(problem, mesh, h[part], t[part], c)
         if len(h) <= chunk:
             return maps
@@ -252,13 +266,6 @@ def _is_constant(c: LinearEquation) -> bool:
     """Whether everything but the forcing is constant in time."""
     basis = None if c.constraints is None else c.constraints.basis
     return all(matrix is None or len(matrix) == 1 for matrix in (c.E, c.A, basis))
-
-
-def at_points(values: Array, k: int, s: int) -> Array:
-    """(k (s + 1), ...) -> (k, s + 1, ...); (1, ...) -> (1, 1, ...)."""
-    if len(values) == 1:
-        return values[None]
-    return values.reshape(k, s + 1, *values.shape[1:])
 
 
 def _solve_elements(
@@ -290,53 +297,7 @@ def _solve_elements(
     if 1 < groups < k:
         homogeneous = homogeneous[group]
     extras = [at_points(extra, k, s) for extra in c.extras]
-    return [homogeneous, particular, _noise(h, t, c), *extras]
-
-
-def _noise(h: Array, t: Array, c: LinearEquation) -> Array:
-    """By how much relative rounding of each component, and of 1, may move X within an element.
-
-    h times what T brings of |A| and |f|, or of their terms; what rounding of the times t (k, s + 1)
-    makes of A that moves; and, apart, what it makes of f, and of A times what constraints say, that
-    move. Shape (k, n, n + 2 columns); zero where E is not invertible.
-    """
-    k, s = len(h), t.shape[1] - 1
-    d, n = c.A.shape[1:]
-    steady = len(c.A) == len(c.f) == 1
-    whole = np.empty((1 if steady else s + 1, 1 if steady else k, d, n + c.f.shape[2]))
-    whole[..., :n] = at_points(c.A, k, s).swapaxes(0, 1)
-    whole[..., n:] = at_points(c.f, k, s).swapaxes(0, 1)
-    high, low = whole.max(axis=0), whole.min(axis=0)
-    found, moved = np.maximum(high, -low), np.abs(t[:, -1, None, None]) * (high - low)
-    of_time = moved[..., n:]
-    if c.constraints is not None:
-        forcing = at_points(c.A @ c.constraints.offset, k, s)
-        swing = forcing.max(axis=1) - forcing.min(axis=1)
-        of_time = of_time + np.abs(t[:, -1, None, None]) * swing
-    found = h[:, None, None] * (found if c.terms is None else np.maximum(found, c.terms))
-    found[..., :n] += moved[..., :n]
-    found = np.concatenate([found, of_time], axis=2)
-    if c.constraints is not None:
-        return np.asarray(largest_within(at_points(c.constraints.basis, k, s)) @ found)
-    if c.E is None:
-        return np.asarray(found)
-    inverse, singular = inverse_or_none(at_points(c.E, k, s)[:, -1])
-    inverse[singular] = 0.0
-    return np.asarray(np.abs(inverse) @ found)
-
-
-def _with_instants(noise: Array, solution: Trajectory, cuts: Array) -> Array:
-    """Noise, see :func:`_noise`, and by how much rounding of instants (C,) moves X.
-
-    Between an instant and where it should be, X has the slope of the wrong side.
-    """
-    mesh, n = solution.mesh, noise.shape[1]
-    after = np.searchsorted(mesh.edges, cuts)
-    slopes = solution.derivative().values
-    found = np.array(np.broadcast_to(noise, (mesh.size, *noise.shape[1:])))
-    jumps = np.abs(slopes[after, 0] - slopes[after - 1, -1])
-    found[after, :, n : n + jumps.shape[2]] += np.abs(cuts)[:, None, None] * jumps
-    return found
+    return [homogeneous, particular, noise_of(h, t, c), *extras]
 
 
 def solve_constant(D: Array, h: float, E: Array, A: Array, T: Array | None, right: Array) -> Array:

@@ -31,6 +31,7 @@ END = 8.0  # units in the last place of what an end value is made of, lost in so
 VALUE = 32.0  # likewise of any value, which are not carried on
 ROUNDING = 8.0  # units in the last place that cannot be resolved
 LEVEL = 0.3  # coefficients that fall by less than this over two degrees are noise
+_SHOWN = 8.0  # times the noise of coefficients: the most that rounding of constraints may be
 _SAME = 1e-9  # relative difference of rates that are constant
 _FAINT = 1e-6  # of the largest state: errors below that do not end a solution
 _FEW = 1e-3  # of a component: beyond that an error leaves less than three digits
@@ -65,19 +66,22 @@ class Errors(NamedTuple):
 
 
 def estimated_errors(
-    problem: LinearProblem, mesh: Mesh, last: Array, particular: Array, noise: Array, values: Array
+    problem: LinearProblem, mesh: Mesh, last: Array, particular: Array, noise: Array, values: Array,
+    kept: Array | float = 1.0, instants: Array | float = 0.0,
 ) -> Errors:
     """Errors of the point values (K, s + 1, n, columns) of a solution.
 
     Of maps from left ends to right ends, ``last`` (K or 1, n, n), right ends from zero,
     ``particular`` (K, n, columns), and ``noise`` (K, n, n + 2 columns): what the terms of the
     equation, [of each component, alone, and alone by rounding of the time], can bring about in an
-    element; relative rounding of them is an error.
+    element; relative rounding of them is an error. A share of it is ``kept`` (K, n, 1), and that of
+    ``instants`` (K, n, columns) is added.
     """
     rule, (n, columns), most = mesh.rule, problem.start.shape, CHANCE**2
+    rates = noise[..., :n] / mesh.steps[:, None, None]
+    noise = kept * noise
     of_all, of_time = noise[..., : n + columns], noise[..., n + columns :]
-    of_all[..., n:] += _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
-    rates = of_all[..., :n] / mesh.steps[:, None, None]
+    of_all[..., n:] += instants + _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     if (np.abs(rates - rates[0]) <= _SAME * rates[0]).all():
         # Rounding of what is constant may be wrong in the same direction each time; that of times
         # is not, and comes with the share that the bound for all elements before has of this.
@@ -120,7 +124,8 @@ def judged_errors(
     and of what right ends are made of.
     """
     with np.errstate(over="ignore", invalid="ignore"):
-        through = _through_constraints(problem, own)
+        seen = np.maximum(problem.seen, _SHOWN * noise / EPS)
+        through = np.minimum(through_constraints(problem, own), seen)
         total = largest + tail + noise + EPS * (VALUE * own + through)
         if problem.units is None:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
@@ -162,10 +167,10 @@ def least_sizes(problem: LinearProblem, made_of: Array, tol: float) -> Array:
     if problem.units is None:
         made_of = np.full_like(made_of, made_of.max(initial=0.0))
     least = np.maximum(SHARE * made_of, problem.floor)
-    return np.maximum(least, ROUNDING * EPS / tol * _through_constraints(problem, made_of))
+    return np.maximum(least, ROUNDING * EPS / tol * through_constraints(problem, made_of))
 
 
-def _through_constraints(problem: LinearProblem, sizes: Array) -> Array:
+def through_constraints(problem: LinearProblem, sizes: Array) -> Array:
     """What relative rounding of components of these ``sizes`` (n, columns) amounts to in each."""
     if problem.amplification is None:
         return np.zeros_like(sizes)

@@ -20,12 +20,12 @@ from numpy.polynomial import legendre
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.collocation import LinearSolution, at_points, decoupled, unresolved_signals
+from gpebo_cli.numerics.collocation import LinearSolution, decoupled, unresolved_signals
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
-from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
 
@@ -154,6 +154,7 @@ def solve(
         looked = Looked.at(values, mesh.rule)
         sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
         made_of, moved = _terms(A, f, mesh, values, sizes)
+        made_of = sizes if stiff else made_of
         found = _Found(A, Trajectory(mesh, values), looked, sizes, change, made_of, moved, extras)
         tail = unresolved_signals(
             problem, mesh.rule, values, extras, made_of.max(axis=0), tol, looked
@@ -167,7 +168,7 @@ def solve(
         )
     except StiffError:
         return None
-    errors = _errors(march, problem, mesh, found)
+    errors = _errors(march, problem, mesh, found, stiff=stiff)
     lost = errors.lost
     return LinearSolution(
         found.trajectory,
@@ -337,10 +338,13 @@ def _terms(
     return np.abs(values[:, 0]) + h * within, h * within + late * moved
 
 
-def _errors(march: March, problem: LinearProblem, mesh: Mesh, found: _Found) -> Errors:
+def _errors(
+    march: March, problem: LinearProblem, mesh: Mesh, found: _Found, *, stiff: bool
+) -> Errors:
     """Errors of the solution, see :mod:`gpebo_cli.numerics.errors`.
 
-    Of many columns the largest error at each place is carried on, for all of them.
+    Of many columns the largest error at each place is carried on, for all of them. Where it is
+    ``stiff``, rounding of the terms grows from the left end on: a fast mode forgets most of it.
     """
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
@@ -350,8 +354,10 @@ def _errors(march: March, problem: LinearProblem, mesh: Mesh, found: _Found) -> 
     # As in numerics.errors; and what series leave out.
     units = np.ones((n, 1)) if problem.units is None else problem.units
     beside = np.maximum(sizes, SHARE * units * (sizes / units).max(axis=1, keepdims=True))
-    added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + found.change[:, None, None] * beside
-    added += EPS * (END * found.made_of + found.moved)
+    change, h = found.change[:, None, None], mesh.steps[:, None, None]
+    moved = (EPS + change * stiff) * found.moved
+    added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + EPS * END * found.made_of
+    added += change * sizes if stiff else change * beside + moved
     added += np.where(sizes.max(axis=0) > 0.0, _TINY, 0.0)  # what decays to nothing is lost
     start = EPS * np.abs(values[0, 0])
     noise = np.zeros((n, columns))
@@ -359,11 +365,15 @@ def _errors(march: March, problem: LinearProblem, mesh: Mesh, found: _Found) -> 
         before, after = last[:, :2].max(axis=1), last[:, 2:].max(axis=1)
         noise = np.where(after >= LEVEL * before, after, 0.0).max(axis=0).reshape(n, columns)
     if columns > _FEW_COLUMNS:
-        added, start = (x.max(axis=-1, keepdims=True) for x in (added, start))
+        added, start, moved = (x.max(axis=-1, keepdims=True) for x in (added, start, moved))
     signs = random_signs(K, n)[..., None]
+    forcing = np.zeros((1, n, 0))
+    if stiff:
+        slopes = 2.0 * (signs[1:] * (moved / h)[:, :, None]).reshape(K, 1, n, -1)
+        forcing = (rule.points[:, None, None] * slopes).reshape(K * points, n, -1)
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
     start = (signs[0] * start[:, None]).reshape(n, -1)
-    ends, change = march(mesh, A, np.zeros((1, n, 0)), kicks, start, _ROUGH)
+    ends, change = march(mesh, A, forcing, kicks, start, _ROUGH)
     kicks[~np.isfinite(change)] = np.inf
     squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]

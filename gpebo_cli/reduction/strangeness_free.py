@@ -22,6 +22,8 @@ from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks, who
 
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
+_EPS = float(np.finfo(float).eps)
+_MOVED = ("E", "A", "B", "F", "u", "theta", "phi")
 _LOOKS = 32  # times at which the sensitivity to rounding is looked at
 
 
@@ -117,10 +119,19 @@ def shown_rounding(
 
     How rounding of one stage shows in the next depends on how fast the states move, and no bound
     tells it closely. It is seen instead: the equations, multiplied by factors, keep their
-    solutions, and what they say of these ones is different rounding.
+    solutions, and what they say of these ones is different rounding; so do entries that are moved
+    by what rounding of them and of the time may be.
     """
-    c = system.coefficients.taylor(t, structure.mu, inside)
-    factors = np.random.default_rng(0).uniform(1.0, 1.1, (len(t), system.n, 1))
+    c, rng = system.coefficients.taylor(t, structure.mu + 1, inside), np.random.default_rng(0)
+    factors = rng.uniform(1.0, 1.1, (len(t), system.n, 1))
+
+    def moved(x: Array) -> Array:
+        """Coefficients, one order less, moved by rounding of their own and of the time."""
+        slope = x[1:] * np.arange(1.0, len(x)).reshape(-1, *[1] * (x.ndim - 1))
+        wrong = np.abs(x[:-1]) + np.abs(t.reshape(-1, *[1] * (x.ndim - 2)) * slope)
+        return np.asarray(x[:-1] + _EPS * rng.uniform(-1.0, 1.0, wrong.shape) * wrong)
+
+    c = c._replace(**{name: moved(getattr(c, name)) for name in _MOVED})
     E, A, f = c.E * factors, c.A * factors, forcing(c)[..., None] * factors
     found, units = reduced(system, structure, E, A, f, t, 1), structure.scaling.columns[:, None]
     missed = found.inverse[:, :, structure.d :] @ (found.A2 @ (x / units) + found.f2)

@@ -16,10 +16,10 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.structure_numpy import derivative_array, scaled
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.collocation import LinearSolution, at_points, unresolved_signals
+from gpebo_cli.numerics.collocation import LinearSolution, unresolved_signals
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
-from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.problem import LinearProblem, at_points
 from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.reduction.strangeness_free import forcing
 from gpebo_cli.reduction.structure import Structure

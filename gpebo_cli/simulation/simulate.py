@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
-from gpebo_cli.model.text import FollowsSignals
+from gpebo_cli.model.text import FollowsSignals, blur_of
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -40,6 +40,7 @@ _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only w
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _TINY = float(np.finfo(float).tiny)
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
+_LITTLE = 1e-11  # of a state: rounding of constraints of which a bound is below is not looked at
 _SAME = 1e3  # tolerances, by which a closer look moves nothing
 
 
@@ -158,20 +159,17 @@ def _solved(
         least = largest_over_time(C, 2) @ least
         return [(u, SHARE * terms(size)), (y, least)]
 
-    def missed(mesh: Mesh, values: Array) -> Array:
-        some = slice(None, None, -(-mesh.size // _LOOKED_AT))
-        at = mesh.points[some, -1], mesh.inside[some, -1]
-        return shown_rounding(system, structure, *at, values[some, -1])
-
     # Where the constraints leave nothing of the state asked for, its rounding is no signal.
     floor = SHARE * np.abs(system.initial_state)
     if structure.a:
         floor = np.maximum(floor, np.abs(first.basis[0]) @ (np.abs(first.E1[0]) @ floor))
     units = structure.scaling.columns[:, None]
+    within = _within(first, float(mesh.steps.max()))
     problem = LinearProblem(
         coefficients, x0[:, None], monitor, f"plant {system.name}", floor[:, None],
-        _amplification(first, structure.scaling.columns, float(mesh.steps.max())),
-        units=units, missed=missed if structure.stages else None,
+        _amplification(first, structure.scaling.columns, within),
+        units=units, missed=partial(_missed, system, structure, within) if structure.a else None,
+        rate=structure.rate, blur=partial(blur_of, system.coefficients),
     )
     if independent:
         problem = replace(problem, coefficients=explicit)
@@ -262,22 +260,45 @@ def _growth_resolved(
     return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
 
 
-def _amplification(form: StrangenessFree, units: Array, step: float) -> Array:
+def _missed(
+    system: DescriptorSystem, structure: Structure, within: Array, mesh: Mesh, values: Array,
+    bound: Array,
+) -> Array | None:
+    """:func:`shown_rounding` along values on a mesh, and what :func:`_within` a step brings of it.
+
+    None: its ``bound`` (n, 1) is little already where derivative arrays do, or nothing is seen.
+    """
+    if not structure.stages and (bound <= _LITTLE * largest_over_time(values, 2)).all():
+        return None
+    some = slice(None, None, -(-mesh.size // _LOOKED_AT))
+    at = mesh.points[some, -1], mesh.inside[some, -1]
+    try:
+        squares = shown_rounding(system, structure, *at, values[some, -1]) ** 2
+    except ModelError:
+        return None  # no rank is clear beside so much rounding
+    return np.asarray(np.sqrt(squares + within**2 @ squares))
+
+
+def _within(form: StrangenessFree, step: float) -> Array:
+    """Which share of an error of each state the equations bring to each state within a ``step``."""
+    some = slice(None, None, max(1, len(form.E1) // _LOOKED_AT))
+    T, A1 = form.basis[some], form.A1[some if len(form.A1) > 1 else slice(None)]
+    return np.asarray(np.minimum(step * (np.abs(T) @ np.abs(A1)).max(axis=0), 1.0))
+
+
+def _amplification(form: StrangenessFree, units: Array, within: Array) -> Array:
     """By how much relative rounding of each state, and of 1, reaches each state, (n, n + 1).
 
     Through the constraints; through x = T z of z = E1 x, where a state that is the small difference
     of large components of z is rounding of those, and an entry of T that is nothing beside the
     others (in ``units`` of the states (n,)) is rounding as a whole; and through the equations
-    within a ``step`` (seconds), because what integrates rounding is no signal either.
+    :func:`_within` a step, because what integrates rounding is no signal either.
     """
     some = slice(None, None, max(1, len(form.E1) // _LOOKED_AT))
-    E1, A1 = form.E1[some], form.A1[some if len(form.A1) > 1 else slice(None)]
-    found = form.amplification.copy()
-    T, E1 = np.abs(form.basis[some]), np.abs(E1)
+    found, T, E1 = form.amplification.copy(), np.abs(form.basis[some]), np.abs(form.E1[some])
     sizes = T / units[:, None] * (E1 @ units)[:, None]
     rounding = np.where(sizes > NOTHING * sizes.max(initial=0.0), T, T / EPS)
     found[:, :-1] += (rounding @ E1).max(axis=0)
-    within = np.minimum(step * (T @ np.abs(A1)).max(axis=0), 1.0)
     once = within @ found
     return np.asarray(found + once + within @ once)
 

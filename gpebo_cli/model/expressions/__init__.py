@@ -17,6 +17,7 @@ from gpebo_cli.model.expressions.bounds import (
     Bounds,
     Cells,
     among,
+    blurred,
     breakpoints,
     halved,
     resolved,
@@ -37,6 +38,6 @@ from gpebo_cli.model.expressions.tape import (
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",
-    "breakpoints", "divisors_of", "halved", "on_their_side", "parse", "record", "resolved",
-    "resolved_along", "shorten", "signal", "switched", "taylor", "with_others",
+    "blurred", "breakpoints", "divisors_of", "halved", "on_their_side", "parse", "record",
+    "resolved", "resolved_along", "shorten", "signal", "switched", "taylor", "with_others",
 ]

@@ -40,6 +40,8 @@ _FOR_EACH = 2  # cells for each element of those, if these are more
 _SAME = 1e-12  # of the span: found instants closer than this to another are that one
 _ROUNDING = 1e-14  # of an argument: changes of sign within it are not looked for
 _MOST_SWITCHED = 1 << 16
+_WIDTH = 0.125  # of bounds of an argument at one time that its rounding is
+_MULTIPLE = 3  # orders of roots
 _BISECTIONS = 100  # more than enough to leave two neighbouring floats
 
 
@@ -315,6 +317,23 @@ def _bisected(arguments: Tape, cells: Array) -> Array:
     inner = halved(lambda t: sign(t, t), before, low, high)
     found = np.where(between, inner, np.where(at_low, low, high))
     return np.asarray(found[between | at_low | at_high])
+
+
+def blurred(tape: Tape, t: Array) -> Array:
+    """By how much changes of sign at times t (N,) may be wrong by rounding of arguments, seconds.
+
+    An argument f that may vanish is rounded by some ε: less than min_k |ε/f_k|^(1/k) does not show.
+    """
+    arguments = tape.of([s.argument for s in tape.switches if s.affine is None])
+    if not arguments.outputs or not len(t):
+        return np.zeros(len(t))
+    least, most = (bound[0] for bound in Bounds(arguments).of(t, t, 0))
+    orders = np.arange(1, _MULTIPLE + 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = _WIDTH * (most - least) / np.abs(arguments.taylor(t, _MULTIPLE, t)[1:])
+    within = (share ** (1.0 / orders[:, None, None])).min(axis=0)
+    vanishes = (least <= 0.0) & (most >= 0.0) & np.isfinite(within)
+    return np.asarray(np.where(vanishes, within, 0.0).max(axis=1))
 
 
 def switched(arguments: Tape, t: Array, signals: Callable[[Array, int], Array]) -> Array:
