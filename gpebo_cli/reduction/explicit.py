@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.model.entries import Entries, Places
+from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.series import Sparse
@@ -129,17 +129,8 @@ def _size(a: Array) -> float:
     return float(np.abs(a[0]).max())
 
 
-def _divided(values: Array, which: IntArray, factor: Array) -> Array:
-    """Some of the values (orders, N or 1, e) times factors (orders, N or 1, w)."""
-    new = product(values[:, :, which], factor)
-    count = max(values.shape[1], new.shape[1])
-    out = np.array(np.broadcast_to(values, (len(values), count, values.shape[2])))
-    out[:, :, which] = new
-    return out
-
-
 def _at_times(values: Array, count: int, which: IntArray) -> Array:
-    """Some of the values (orders, N or 1, e) themselves at ``count`` times, (count, w)."""
+    """Some of the values (orders, N or 1, v) themselves at ``count`` times, (count, w)."""
     out, every = np.empty((count, len(which))), values.shape[1] == 1
     for first in range(0, count, _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
@@ -150,10 +141,11 @@ def _at_times(values: Array, count: int, which: IntArray) -> Array:
 class _Equations:
     """Rows of entries; one becomes a mapping where it is touched."""
 
-    def __init__(self, values: Array, places: Places, known: Row, units: Array) -> None:
-        n = len(units)
-        self.values, self.order = values, np.lexsort(places[::-1])
-        self.place = [place[self.order] for place in places]  # rows, and columns
+    def __init__(self, found: Entries, name: str, known: Row, units: Array) -> None:
+        n, places = len(units), found.places[name]
+        order = np.lexsort(places[::-1])
+        self.values, self.order = getattr(found.values, name), found.which(name)[order]
+        self.place = [place[order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
         self.known = dict(known)  # in those rows that have something
         self.units = units
@@ -188,7 +180,11 @@ class _Equations:
         divided[rows] = True
         factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
         of_row = place[self.place[0][which]]
-        self.values = _divided(self.values, self.order[which], factor[:, :, of_row])
+        new = product(self.values[:, :, self.order[which]], factor[:, :, of_row])
+        count = max(self.values.shape[1], new.shape[1])
+        values = np.broadcast_to(self.values, (len(self.values), count, self.values.shape[2]))
+        self.values, self.order = values.take(self.order, axis=2), np.arange(len(self.order))
+        self.values[:, :, which] = new
         for i in self.known.keys() & set(rows.tolist()):
             self.known[i] = product(self.known[i], factor[:, :, place[i]])
 
@@ -289,9 +285,14 @@ class _Equations:
         return self.row(i).pop(k)
 
 
+def sizes_of(found: Entries, name: str) -> Array:
+    """The largest of each entry over time, (e,)."""
+    return largest_over_time(getattr(found.values, name)[0])[found.which(name)]
+
+
 def scaling_of(found: Entries, n: int) -> Scaling:
     """:func:`balance` of the entries of n equations."""
-    sizes = [largest_over_time(getattr(found.values, name)[0]) for name in "EA"]
+    sizes = [sizes_of(found, name) for name in "EA"]
     (i, j), kind = np.hstack([found.places[name] for name in "EA"]), [*map(len, sizes)]
     return balance_entries(np.concatenate(sizes), (np.repeat([0, 1], kind), i, j), n)
 
@@ -303,8 +304,8 @@ def explicit_form(found: Entries, scaling: Scaling, f: Row) -> Explicit:
     which there is something.
     """
     units = scaling.columns
-    A = _Equations(found.values.A, found.places["A"], f, units)
-    E = _Equations(found.values.E, found.places["E"], {}, units)
+    A = _Equations(found, "A", f, units)
+    E = _Equations(found, "E", {}, units)
     equation_of = _leading(E, A)
     shifts = _shifted(E, A, equation_of)
     count = len(shifts)
