@@ -18,6 +18,7 @@ from gpebo_cli.numerics.collocation import at_points
 from gpebo_cli.numerics.mesh import Mesh, equal_lengths
 
 _SMALL = 1e-280  # terms below it have lost digits
+_AT_ONCE = 8  # elements
 _FILL = 4  # blocks of size s × s per state that elimination may couple; with more A is not sparse
 
 
@@ -31,16 +32,22 @@ def by_elimination(
 ) -> tuple[Array, Array]:
     """A march, see :mod:`.series`: values (K, s + 1, d, c), and what is left of the equations (K,).
 
-    That is not looked at with ``kicks``.
+    With ``kicks`` that is not looked at, and values are those of right ends.
     """
     _, h = equal_lengths(mesh.steps, mesh)
     D, (rows, columns, entries) = mesh.rule.differentiation, A
-    values = elements.stiff(
-        D, h, *steps_of(rows.tobytes(), columns.tobytes()), entries, f, kicks, start
-    )
-    if kicks is not None:
-        return values, np.zeros(len(h))
-    return values, _residual(D, h, rows, columns, entries, f, values)
+    steps, points = steps_of(rows.tobytes(), columns.tobytes()), len(D) + 1
+    if kicks is None:
+        values = elements.stiff(D, h, *steps, entries, f, None, start)
+        return values, _residual(D, h, rows, columns, entries, f, values)
+    ends = np.empty((len(h), 1, *start.shape))
+    for first in range(0, len(h), _AT_ONCE):  # values between ends are as much as all else
+        part = slice(first, first + _AT_ONCE)
+        some = slice(first * points, (first + _AT_ONCE) * points)
+        known = (x if len(x) == 1 else x[some] for x in (entries, f))
+        ends[part] = elements.stiff(D, h[part], *steps, *known, kicks[part], start)[:, -1:]
+        start = (ends[part] + kicks[part, None])[-1, 0]
+    return ends, np.zeros(len(h))
 
 
 def _residual(
@@ -63,14 +70,16 @@ def _residual(
     right = np.zeros_like(values)  # at left ends, too: parts of arrays would be copied
     right[..., there] = sums(a[:, :, None], values)
     right[:, :, : f.shape[2]] += f
-    left = np.matmul(D / h, (values[:, 1:] - values[:, :1]).reshape(K, points - 1, -1))
+    left = np.matmul(D, (values[:, 1:] - values[:, :1]).reshape(K, points - 1, -1))
+    left /= h
     right[:, 1:] -= left.reshape(K, points - 1, *values.shape[2:])
+    del left
     largest = np.abs(values).max(axis=1)
     size = np.abs(D).sum(axis=1).max() / h * largest
     size[..., there] += sums(np.abs(a).max(axis=1)[:, None], largest)
     size[:, : f.shape[2]] += np.abs(f).max(axis=1)
-    left = np.abs(right[:, 1:]).max(axis=1)
-    return np.asarray((left / np.maximum(size, _SMALL)).max(axis=(1, 2)))
+    most = np.abs(right, out=right)[:, 1:].max(axis=1)
+    return np.asarray((most / np.maximum(size, _SMALL)).max(axis=(1, 2)))
 
 
 @lru_cache(maxsize=16)
