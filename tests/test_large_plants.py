@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from kernel_paths import needs_kernels
 from scipy.linalg import eigh, expm, null_space
 from scipy.sparse import csr_matrix
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -335,6 +336,7 @@ def test_a_thousand_states_take_no_square_of_memory():
     np.testing.assert_allclose(x[..., -1], x[..., 0], atol=1e-12)
 
 
+@needs_kernels
 @pytest.mark.parametrize(("varying", "states", "experiment"), [(False, 6, 4), (True, 10, 4.5)])
 def test_little_more_than_the_result_is_held(varying, states, experiment):
     """Of 41 states over all elements, and of Φ and G, which are 41 times as much each."""
@@ -352,6 +354,17 @@ def test_little_more_than_the_result_is_held(varying, states, experiment):
         size = simulated().signals.states.values.nbytes
         work()  # what is kept for good is there then
         assert ladders._peak(work) < most * size
+
+
+@needs_kernels
+@pytest.mark.parametrize(
+    ("n", "kind", "varying"),
+    [(7, "index 1", False), *((n, kind, True) for n in (11, 41) for kind in ladders.KINDS)],
+)
+def test_ladders_hold_less_than_ten_times_their_result(n, kind, varying):
+    work = ladders.simulation(n, kind, varying=varying)
+    size = work().signals.states.values.nbytes  # what is kept for good is there then
+    assert ladders._peak(work) < 10 * size
 
 
 def observed(unknown, n=CELLS, **observer):

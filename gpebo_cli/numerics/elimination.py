@@ -44,8 +44,8 @@ def by_elimination(
     for first in range(0, len(h), _AT_ONCE):  # values between ends are as much as all else
         part = slice(first, first + _AT_ONCE)
         some = slice(first * points, (first + _AT_ONCE) * points)
-        known = (x if len(x) == 1 else x[some] for x in (entries, f))
-        ends[part] = elements.stiff(D, h[part], *steps, *known, kicks[part], start)[:, -1:]
+        a, known = (x if len(x) == 1 else x[some] for x in (entries, f))
+        ends[part] = elements.stiff(D, h[part], *steps, a, known, kicks[part], start)[:, -1:]
         start = (ends[part] + kicks[part, None])[-1, 0]
     return ends, np.zeros(len(h))
 

@@ -181,8 +181,8 @@ class _Equations:
         factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
         of_row = place[self.place[0][which]]
         new = product(self.values[:, :, self.order[which]], factor[:, :, of_row])
-        count = max(self.values.shape[1], new.shape[1])
-        values = np.broadcast_to(self.values, (len(self.values), count, self.values.shape[2]))
+        orders, times, number = self.values.shape
+        values = np.broadcast_to(self.values, (orders, max(times, new.shape[1]), number))
         self.values, self.order = values.take(self.order, axis=2), np.arange(len(self.order))
         self.values[:, :, which] = new
         for i in self.known.keys() & set(rows.tolist()):
