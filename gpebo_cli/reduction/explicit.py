@@ -129,13 +129,9 @@ def _size(a: Array) -> float:
     return float(np.abs(a[0]).max())
 
 
-def _at_times(values: Array, count: int, which: IntArray) -> Array:
-    """Some of the values (orders, N or 1, v) themselves at ``count`` times, (count, w)."""
-    out, every = np.empty((count, len(which))), values.shape[1] == 1
-    for first in range(0, count, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        out[some] = values[0, slice(None) if every else some].take(which, axis=1)
-    return out
+def _picked(values: Array, some: slice, which: IntArray) -> Array:
+    """Some of the values (orders, N or 1, v) themselves at some of the times, (· or 1, w)."""
+    return values[0, some if values.shape[1] > 1 else slice(None)].take(which, axis=1)
 
 
 class _Equations:
@@ -150,6 +146,7 @@ class _Equations:
         self.known = dict(known)  # in those rows that have something
         self.units = units
         self.rows: dict[int, Row] = {}  # those that were touched
+        self.factors, self.divided = np.ones((1, 1, 0)), np.full(n, -1)  # which one a row waits for
         self.least = 1.0  # pivot so far, relative to its row
         by_column = np.argsort(self.place[1], kind="stable")
         self._in_column = self.place[0][by_column]
@@ -160,7 +157,9 @@ class _Equations:
         """Row i, to be changed."""
         if i not in self.rows:
             part = slice(self.first[i], self.first[i + 1])
-            values = np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy()
+            values = list(np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy())
+            if self.divided[i] >= 0:
+                values = [product(v, self.factors[:, :, self.divided[i]]) for v in values]
             self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
         return self.rows[i]
 
@@ -172,21 +171,10 @@ class _Equations:
         return self._where[k]
 
     def divide(self, rows: IntArray, pivots: Array) -> None:
-        """Divide untouched rows (r,) by pivots (orders, N or 1, r)."""
-        count = np.diff(self.first)
-        place = np.zeros(len(count), dtype=np.intp)
-        place[rows] = np.arange(len(rows))
-        divided = np.zeros(len(count), dtype=bool)
-        divided[rows] = True
-        factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
-        of_row = place[self.place[0][which]]
-        new = product(self.values[:, :, self.order[which]], factor[:, :, of_row])
-        orders, times, number = self.values.shape
-        values = np.broadcast_to(self.values, (orders, max(times, new.shape[1]), number))
-        self.values, self.order = values.take(self.order, axis=2), np.arange(len(self.order))
-        self.values[:, :, which] = new
+        """Divide untouched rows (r,) by pivots (orders, N or 1, r), their entries when needed."""
+        self.factors, self.divided[rows] = _reciprocal(pivots), np.arange(len(rows))
         for i in self.known.keys() & set(rows.tolist()):
-            self.known[i] = product(self.known[i], factor[:, :, place[i]])
+            self.known[i] = product(self.known[i], self.factors[:, :, self.divided[i]])
 
     def assembled(self, chosen: IntArray, states: IntArray) -> Sparse:
         """Rows ``chosen`` (d,), with columns ``states`` (d,)."""
@@ -202,13 +190,20 @@ class _Equations:
         ]
         i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
         j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
-        count = max([self.values.shape[1], *(len(t[2]) for t in touched)])
+        values = self.values, self.factors, *(t[2][None] for t in touched)
+        count = max(value.shape[1] for value in values)
         order = np.argsort(i, kind="stable")
         place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
         place[order] = np.arange(len(i))
         of_plain = np.zeros(len(i), dtype=np.intp)
         of_plain[place[: plain.sum()]] = self.order[plain]
-        entries = _at_times(self.values, count, of_plain)
+        factor = self.divided[self.place[0][plain]]
+        waiting, factor = place[: plain.sum()][factor >= 0], factor[factor >= 0]
+        entries = np.empty((count, len(i)))
+        for first in range(0, count, _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            entries[some] = _picked(self.values, some, of_plain)
+            entries[some, waiting] *= _picked(self.factors, some, factor)
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
