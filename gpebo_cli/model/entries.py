@@ -24,7 +24,7 @@ class Entries(NamedTuple):
 
     values: Coefficients  # (orders, N or 1, v) each; 1 for a matrix that is constant
     places: Mapping[str, Places]  # of the entries, by the names of the matrices
-    shared: Mapping[str, IntArray] = MappingProxyType({})  # which value each has, if not its own
+    shared: Mapping[str, IntArray] = MappingProxyType({})  # (e,) which value, if not its own
 
     def which(self, name: str) -> IntArray:
         """Which of the values each entry of a matrix has, (e,)."""
