@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from kernel_paths import needs_kernels
 from scipy.linalg import eigh, expm, null_space
 from scipy.sparse import csr_matrix
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -92,7 +93,7 @@ def chain(cells):
 PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
 
 
-def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1):
+def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1):
     E, A, B, C = build(cells)
     n = len(E)
 
@@ -101,9 +102,11 @@ def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1):
                 for i, row in enumerate(matrix.tolist())]
 
     return load_plant({
-        "name": build.__name__, "states": [f"x{k}" for k in range(n)], "inputs": {"u": u},
+        "name": build.__name__, "states": [f"x{k}" for k in range(n)],
+        "inputs": {f"u{k}": u for k in range(inputs)},
         "outputs": ["y1", "y2"], "E": text(E, "1 + 0.3*cos(t + {})"),
-        "A": text(rate * A, f"1 + 0.2*sin({swing}*t + {{}})"), "B": B.tolist(), "C": C.tolist(),
+        "A": text(rate * A, f"1 + 0.2*sin({swing}*t + {{}})"),
+        "B": np.repeat(B / inputs, inputs, axis=1).tolist(), "C": C.tolist(),
         "initial_state": [1.0, 0.5, *[0.1] * (n - 2)],
     })
 
@@ -129,6 +132,12 @@ def test_structure_start_and_solution_are_those_of_the_derivative_array(build, v
     assert (wrong < 10.0 * found.state_errors + 1e-12).all()
     assert found.state_errors.max() < 1e-8
     np.testing.assert_allclose(found.signals.outputs(t), dense.signals.outputs(t), atol=1e-8)
+
+
+def test_inputs_may_be_the_same_function():
+    one, two = (large.large_simulation(plant(ladder, inputs=count), TIME, SolverSettings())
+                for count in (1, 2))
+    np.testing.assert_allclose(two.signals.states.final, one.signals.states.final, atol=1e-12)
 
 
 def test_a_jump_of_the_input_moves_algebraic_states_only():
@@ -350,6 +359,7 @@ def test_a_thousand_states_take_no_square_of_memory():
     np.testing.assert_allclose(x[..., -1], x[..., 0], atol=1e-12)
 
 
+@needs_kernels
 @pytest.mark.parametrize(("varying", "states", "experiment"), [(False, 6, 4), (True, 10, 4.5)])
 def test_little_more_than_the_result_is_held(varying, states, experiment):
     """Of 41 states over all elements, and of Φ and G, which are 41 times as much each."""
@@ -367,6 +377,17 @@ def test_little_more_than_the_result_is_held(varying, states, experiment):
         size = simulated().signals.states.values.nbytes
         work()  # what is kept for good is there then
         assert ladders._peak(work) < most * size
+
+
+@needs_kernels
+@pytest.mark.parametrize(
+    ("n", "kind", "varying"),
+    [(7, "index 1", False), *((n, kind, True) for n in (11, 41) for kind in ladders.KINDS)],
+)
+def test_ladders_hold_less_than_ten_times_their_result(n, kind, varying):
+    work = ladders.simulation(n, kind, varying=varying)
+    size = work().signals.states.values.nbytes  # what is kept for good is there then
+    assert ladders._peak(work) < 10 * size
 
 
 def observed(unknown, n=CELLS, **observer):

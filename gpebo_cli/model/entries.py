@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
@@ -21,12 +22,17 @@ Places = tuple[IntArray, ...]  # rows, and columns of a matrix, (e,) each
 class Entries(NamedTuple):
     """Taylor coefficients at N times of every entry that is not always zero."""
 
-    values: Coefficients  # (orders, N or 1, e) each; 1 for a matrix that is constant
+    values: Coefficients  # (orders, N or 1, v) each; 1 for a matrix that is constant
     places: Mapping[str, Places]  # of the entries, by the names of the matrices
+    shared: Mapping[str, IntArray] = MappingProxyType({})  # (e,) which value, if not its own
+
+    def which(self, name: str) -> IntArray:
+        """Which of the values each entry of a matrix has, (e,)."""
+        return self.shared.get(name, np.arange(len(self.places[name][0])))
 
     def of(self, name: str) -> dict[tuple[int, ...], Array]:
         """Coefficients (orders, N or 1) by the place of an entry."""
-        values = np.ascontiguousarray(np.moveaxis(getattr(self.values, name), 2, 0))
+        values = np.moveaxis(getattr(self.values, name), 2, 0)[self.which(name)]
         places = [place.tolist() for place in self.places[name]]
         return dict(zip(zip(*places, strict=True), values, strict=True))
 

@@ -11,7 +11,13 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, CoefficientSource
+from gpebo_cli.model.descriptor import (
+    MATRIX_NAMES,
+    Array,
+    Coefficients,
+    CoefficientSource,
+    IntArray,
+)
 from gpebo_cli.model.entries import Entries, Places, entries_of
 from gpebo_cli.model.expressions import (
     Assembly,
@@ -212,27 +218,29 @@ class TextCoefficients:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
         if self.tables:
             return entries_of(self.taylor(t, order, inside), self.constant)
-        moving, values = self.tape.taylor(t, order, self._amid(inside)), []
-        for fixed, columns, _ in self._places:
-            found = moving[:, :, columns] if columns.stop else moving[:, :1, columns]
-            if len(fixed):
-                own, found = found, np.zeros((*found.shape[:2], len(fixed) + found.shape[2]))
-                found[0, :, : len(fixed)] = fixed
-                found[:, :, len(fixed) :] = own
-            values.append(found)
-        places = (where for _, _, where in self._places)
-        return Entries(Coefficients(*values), dict(zip(MATRIX_NAMES, places, strict=True)))
+        apart, places, shared = self._apart
+        values = Coefficients(*apart.taylor(t, order, self._amid(inside)))
+        once = {name: getattr(values, name)[:, :1] for name in self.constant}
+        return Entries(values._replace(**once), places, shared)
 
     @cached_property
-    def _places(self) -> list[tuple[Array, slice, Places]]:
-        """Of each matrix its constant entries, which results of the tape are others, and where."""
-        found, targets = [], self.assembly.targets
-        for k, matrix in enumerate(self.assembly.fixed):
-            fixed, columns = np.flatnonzero(matrix), np.flatnonzero(targets[:, 0] == k)
-            there = np.concatenate([fixed, targets[columns, 1]])
-            some = slice(columns[0], columns[-1] + 1) if len(columns) else slice(0)  # in a row
-            found.append((matrix.flat[fixed], some, np.unravel_index(there, matrix.shape)))
-        return found
+    def _apart(self) -> tuple[Assembly, dict[str, Places], dict[str, IntArray]]:
+        """Entries that are not zero, equal ones of a matrix once; where they are, and which."""
+        targets, fixed = self.assembly.targets.copy(), []
+        places: dict[str, Places] = {}
+        shared: dict[str, IntArray] = {}
+        for k, (name, matrix) in enumerate(zip(MATRIX_NAMES, self.assembly.fixed, strict=True)):
+            known, moving = np.flatnonzero(matrix), np.flatnonzero(targets[:, 0] == k)
+            there = np.concatenate([known, targets[moving, 1]])
+            places[name] = np.unravel_index(there, matrix.shape)
+            values, seen = matrix.flat[known], dict[object, int]()
+            which = [*values.tolist(), *((self.tape.outputs[j],) for j in moving.tolist())]
+            keys = which if matrix.ndim > 1 else range(len(which))
+            shared[name] = np.array([seen.setdefault(key, len(seen)) for key in keys], np.intp)
+            targets[moving, 1] = shared[name][len(known) :]
+            fixed.append(np.zeros(len(seen)))
+            fixed[k][shared[name][: len(known)]] = values
+        return Assembly(self.tape, targets, tuple(fixed)), places, shared
 
     @property
     def of_time(self) -> TextCoefficients:

@@ -13,11 +13,12 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 
 from gpebo_cli.kernels import elements
-from gpebo_cli.kernels.elements_numpy import at_nodes
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.mesh import Mesh, equal_lengths
+from gpebo_cli.numerics.problem import at_points
 
 _SMALL = 1e-280  # terms below it have lost digits
+_AT_ONCE = 8  # elements
 _FILL = 4  # blocks of size s × s per state that elimination may couple; with more A is not sparse
 
 
@@ -31,43 +32,54 @@ def by_elimination(
 ) -> tuple[Array, Array]:
     """A march, see :mod:`.series`: values (K, s + 1, d, c), and what is left of the equations (K,).
 
-    That is not looked at with ``kicks``.
+    With ``kicks`` that is not looked at, and values are those of right ends.
     """
     _, h = equal_lengths(mesh.steps, mesh)
     D, (rows, columns, entries) = mesh.rule.differentiation, A
-    values = elements.stiff(
-        D, h, *steps_of(rows.tobytes(), columns.tobytes()), entries, f, kicks, start
-    )
-    if kicks is not None:
-        return values, np.zeros(len(h))
-    return values, _residual(D / h[:, None, None], rows, columns, entries, f, values)
+    steps, points = steps_of(rows.tobytes(), columns.tobytes()), len(D) + 1
+    if kicks is None:
+        values = elements.stiff(D, h, *steps, entries, f, None, start)
+        return values, _residual(D, h, rows, columns, entries, f, values)
+    ends = np.empty((len(h), 1, *start.shape))
+    for first in range(0, len(h), _AT_ONCE):  # values between ends are as much as all else
+        part = slice(first, first + _AT_ONCE)
+        some = slice(first * points, (first + _AT_ONCE) * points)
+        a, known = (x if len(x) == 1 else x[some] for x in (entries, f))
+        ends[part] = elements.stiff(D, h[part], *steps, a, known, kicks[part], start)[:, -1:]
+        start = (ends[part] + kicks[part, None])[-1, 0]
+    return ends, np.zeros(len(h))
 
 
 def _residual(
-    Dh: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array, values: Array
+    D: Array, h: Array, rows: IntArray, columns: IntArray, entries: Array, f: Array, values: Array
 ) -> Array:
     """What is left of each element's equations, relative to the largest of their terms (K,).
 
     No pivots are sought beyond the states' own unknowns: this says whether that did harm.
     """
-    K, points = values.shape[:2]
+    (K, points), h = values.shape[:2], h[:, None, None]
     values, there = values.swapaxes(2, 3), np.diff(rows) > 0  # states last: their sums are fast
-    X, f = values[:, 1:], at_nodes(f, K, points - 1).swapaxes(2, 3)
-    a, first = at_nodes(entries, K, points - 1), rows[:-1][there]
+    a, f, first = at_points(entries, K, points - 1), at_points(f, K, points - 1), rows[:-1][there]
+    f = f.swapaxes(2, 3)
 
     def sums(entries: Array, values: Array) -> Array:
-        terms = values[..., columns]
+        terms = values.take(columns, axis=-1)
         terms *= entries  # in place: these are as much as all else
         return np.asarray(np.add.reduceat(terms, first, axis=-1))
 
-    left = np.matmul(Dh, (X - values[:, :1]).reshape(K, points - 1, -1)).reshape(X.shape)
-    left[..., there] -= sums(a[:, :, None], X)
-    left[:, :, : f.shape[2]] -= f
+    right = np.zeros_like(values)  # at left ends, too: parts of arrays would be copied
+    right[..., there] = sums(a[:, :, None], values)
+    right[:, :, : f.shape[2]] += f
+    left = np.matmul(D, (values[:, 1:] - values[:, :1]).reshape(K, points - 1, -1))
+    left /= h
+    right[:, 1:] -= left.reshape(K, points - 1, *values.shape[2:])
+    del left
     largest = np.abs(values).max(axis=1)
-    size = np.abs(Dh).sum(axis=2).max(axis=1)[:, None, None] * largest
+    size = np.abs(D).sum(axis=1).max() / h * largest
     size[..., there] += sums(np.abs(a).max(axis=1)[:, None], largest)
     size[:, : f.shape[2]] += np.abs(f).max(axis=1)
-    return np.asarray((np.abs(left).max(axis=1) / np.maximum(size, _SMALL)).max(axis=(1, 2)))
+    most = np.abs(right, out=right)[:, 1:].max(axis=1)
+    return np.asarray((most / np.maximum(size, _SMALL)).max(axis=(1, 2)))
 
 
 @lru_cache(maxsize=16)

@@ -46,11 +46,11 @@ def _of_terms(h: Array, t: Array, c: LinearEquation) -> Array:
     """
     k, s = len(h), t.shape[1] - 1
     d, n = c.A.shape[1:]
-    steady = len(c.A) == len(c.f) == 1
-    whole = np.empty((1 if steady else s + 1, 1 if steady else k, d, n + c.f.shape[2]))
-    whole[..., :n] = at_points(c.A, k, s).swapaxes(0, 1)
-    whole[..., n:] = at_points(c.f, k, s).swapaxes(0, 1)
-    high, low = whole.max(axis=0), whole.min(axis=0)
+    high, low = np.empty((2, max(len(c.A), len(c.f)) // (s + 1) or 1, d, n + c.f.shape[2]))
+    for part, values in ((slice(n), c.A), (slice(n, None), c.f)):
+        along = np.ascontiguousarray(at_points(values, k, s).swapaxes(0, 1))
+        high[..., part], low[..., part] = along.max(axis=0), along.min(axis=0)
+    del along
     found, moved = np.maximum(high, -low), np.abs(t[:, -1, None, None]) * (high - low)
     of_time = moved[..., n:]
     if c.constraints is not None:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.model.entries import Entries, Places
+from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.series import Sparse
@@ -129,35 +129,24 @@ def _size(a: Array) -> float:
     return float(np.abs(a[0]).max())
 
 
-def _divided(values: Array, which: IntArray, factor: Array) -> Array:
-    """Some of the values (orders, N or 1, e) times factors (orders, N or 1, w)."""
-    new = product(values[:, :, which], factor)
-    count = max(values.shape[1], new.shape[1])
-    out = np.array(np.broadcast_to(values, (len(values), count, values.shape[2])))
-    out[:, :, which] = new
-    return out
-
-
-def _at_times(values: Array, count: int, which: IntArray) -> Array:
-    """Some of the values (orders, N or 1, e) themselves at ``count`` times, (count, w)."""
-    out, every = np.empty((count, len(which))), values.shape[1] == 1
-    for first in range(0, count, _AT_ONCE):
-        some = slice(first, first + _AT_ONCE)
-        out[some] = values[0, slice(None) if every else some].take(which, axis=1)
-    return out
+def _picked(values: Array, some: slice, which: IntArray) -> Array:
+    """Some of the values (orders, N or 1, v) themselves at some of the times, (· or 1, w)."""
+    return values[0, some if values.shape[1] > 1 else slice(None)].take(which, axis=1)
 
 
 class _Equations:
     """Rows of entries; one becomes a mapping where it is touched."""
 
-    def __init__(self, values: Array, places: Places, known: Row, units: Array) -> None:
-        n = len(units)
-        self.values, self.order = values, np.lexsort(places[::-1])
-        self.place = [place[self.order] for place in places]  # rows, and columns
+    def __init__(self, found: Entries, name: str, known: Row, units: Array) -> None:
+        n, places = len(units), found.places[name]
+        order = np.lexsort(places[::-1])
+        self.values, self.order = getattr(found.values, name), found.which(name)[order]
+        self.place = [place[order] for place in places]  # rows, and columns
         self.first = np.searchsorted(self.place[0], np.arange(n + 1))
         self.known = dict(known)  # in those rows that have something
         self.units = units
         self.rows: dict[int, Row] = {}  # those that were touched
+        self.factors, self.divided = np.ones((1, 1, 0)), np.full(n, -1)  # which one a row waits for
         self.least = 1.0  # pivot so far, relative to its row
         by_column = np.argsort(self.place[1], kind="stable")
         self._in_column = self.place[0][by_column]
@@ -168,7 +157,9 @@ class _Equations:
         """Row i, to be changed."""
         if i not in self.rows:
             part = slice(self.first[i], self.first[i + 1])
-            values = np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy()
+            values = list(np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy())
+            if self.divided[i] >= 0:
+                values = [product(v, self.factors[:, :, self.divided[i]]) for v in values]
             self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
         return self.rows[i]
 
@@ -180,17 +171,10 @@ class _Equations:
         return self._where[k]
 
     def divide(self, rows: IntArray, pivots: Array) -> None:
-        """Divide untouched rows (r,) by pivots (orders, N or 1, r)."""
-        count = np.diff(self.first)
-        place = np.zeros(len(count), dtype=np.intp)
-        place[rows] = np.arange(len(rows))
-        divided = np.zeros(len(count), dtype=bool)
-        divided[rows] = True
-        factor, which = _reciprocal(pivots), np.flatnonzero(divided[self.place[0]])
-        of_row = place[self.place[0][which]]
-        self.values = _divided(self.values, self.order[which], factor[:, :, of_row])
+        """Divide untouched rows (r,) by pivots (orders, N or 1, r), their entries when needed."""
+        self.factors, self.divided[rows] = _reciprocal(pivots), np.arange(len(rows))
         for i in self.known.keys() & set(rows.tolist()):
-            self.known[i] = product(self.known[i], factor[:, :, place[i]])
+            self.known[i] = product(self.known[i], self.factors[:, :, self.divided[i]])
 
     def assembled(self, chosen: IntArray, states: IntArray) -> Sparse:
         """Rows ``chosen`` (d,), with columns ``states`` (d,)."""
@@ -206,13 +190,20 @@ class _Equations:
         ]
         i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
         j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
-        count = max([self.values.shape[1], *(len(t[2]) for t in touched)])
+        values = self.values, self.factors, *(t[2][None] for t in touched)
+        count = max(value.shape[1] for value in values)
         order = np.argsort(i, kind="stable")
         place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
         place[order] = np.arange(len(i))
         of_plain = np.zeros(len(i), dtype=np.intp)
         of_plain[place[: plain.sum()]] = self.order[plain]
-        entries = _at_times(self.values, count, of_plain)
+        factor = self.divided[self.place[0][plain]]
+        waiting, factor = place[: plain.sum()][factor >= 0], factor[factor >= 0]
+        entries = np.empty((count, len(i)))
+        for first in range(0, count, _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            entries[some] = _picked(self.values, some, of_plain)
+            entries[some, waiting] *= _picked(self.factors, some, factor)
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
@@ -289,9 +280,14 @@ class _Equations:
         return self.row(i).pop(k)
 
 
+def sizes_of(found: Entries, name: str) -> Array:
+    """The largest of each entry over time, (e,)."""
+    return largest_over_time(getattr(found.values, name)[0])[found.which(name)]
+
+
 def scaling_of(found: Entries, n: int) -> Scaling:
     """:func:`balance` of the entries of n equations."""
-    sizes = [largest_over_time(getattr(found.values, name)[0]) for name in "EA"]
+    sizes = [sizes_of(found, name) for name in "EA"]
     (i, j), kind = np.hstack([found.places[name] for name in "EA"]), [*map(len, sizes)]
     return balance_entries(np.concatenate(sizes), (np.repeat([0, 1], kind), i, j), n)
 
@@ -303,8 +299,8 @@ def explicit_form(found: Entries, scaling: Scaling, f: Row) -> Explicit:
     which there is something.
     """
     units = scaling.columns
-    A = _Equations(found.values.A, found.places["A"], f, units)
-    E = _Equations(found.values.E, found.places["E"], {}, units)
+    A = _Equations(found, "A", f, units)
+    E = _Equations(found, "E", {}, units)
     equation_of = _leading(E, A)
     shifts = _shifted(E, A, equation_of)
     count = len(shifts)

@@ -16,7 +16,6 @@ from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
-from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Kind,
@@ -39,6 +38,7 @@ from gpebo_cli.reduction.explicit import (
     explicit_form,
     product,
     scaling_of,
+    sizes_of,
 )
 from gpebo_cli.reduction.scaling import Scaling
 from gpebo_cli.reduction.structure import Structure, analyse, without_equations
@@ -79,7 +79,7 @@ def _placed(found: Entries, name: str, size: int) -> Array:
     """A vector of the model, (orders, N or 1, size)."""
     values = getattr(found.values, name)
     out = np.zeros((*values.shape[:2], size))
-    out[:, :, found.places[name][0]] = values
+    out[:, :, found.places[name][0]] = values[:, :, found.which(name)]
     return out
 
 
@@ -129,7 +129,7 @@ class _Plant:
     def _form(self, found: Entries, f: Row) -> Explicit | ConstantForm:
         n, (E, A) = self.system.n, (getattr(found.values, name) for name in "EA")
         may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
-        if self.constant is None and not (may_be_full and E.shape[2] > _ENTRIES * n):
+        if self.constant is None and not (may_be_full and len(found.which("E")) > _ENTRIES * n):
             try:
                 self.scaling = self.scaling or scaling_of(found, n)
                 return explicit_form(found, self.scaling, f)
@@ -139,7 +139,7 @@ class _Plant:
         if self.constant is None:
             full = np.zeros((2, n, n))
             for matrix, name, values in zip(full, "EA", (E, A), strict=True):
-                matrix[found.places[name]] = values[0, 0]
+                matrix[found.places[name]] = values[0, 0, found.which(name)]
             self.constant = constant_form(full[0], full[1], self.most - 1)
         times = max((value.shape[1] for value in f.values()), default=1)
         known = np.zeros((self.order + 1, times, n))
@@ -250,10 +250,9 @@ def _simulated(
         x, y, u = _signals(plant, values)
         size = np.abs(x).max(axis=(0, 1))
         least = np.maximum(SHARE * plant.form.sizes_from(np.abs(values).max(axis=(0, 1))), floor)
-        C = plant.found.values.C[0]
         of_y = np.zeros((system.r, 1))
         np.add.at(of_y, plant.found.places["C"][0],
-                  np.abs(C).max(axis=0)[:, None] * least[plant.found.places["C"][1]])
+                  sizes_of(plant.found, "C")[:, None] * least[plant.found.places["C"][1]])
         shares = SHARE * _beside_inputs(plant.found, size, system.m)
         return [(x, least[:, 0]), (y, of_y[:, 0]), (u, shares)]
 
@@ -277,9 +276,8 @@ def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
 def _beside_inputs(found: Entries, size: Array, m: int) -> Array:
     """:func:`least_beside` m inputs, (m,), with states of some size (n,)."""
     (i, j), (row, column) = found.places["A"], found.places["B"]
-    A, B = (largest_over_time(values[0]) for values in (found.values.A, found.values.B))
-    terms = np.bincount(i, A * size[j], len(size)).astype(np.float64)
-    return least_beside(terms, B, row, column, m)
+    terms = np.bincount(i, sizes_of(found, "A") * size[j], len(size)).astype(np.float64)
+    return least_beside(terms, sizes_of(found, "B"), row, column, m)
 
 
 def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
@@ -312,7 +310,7 @@ def _start(plant: _Plant) -> tuple[Array, Array]:
     def differential(z: Array) -> Array:
         """E (x − x_0) of the state that z gives, (n,)."""
         off = first.states_from(z[None, :, None])[0, :, 0] - x0
-        (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0]
+        (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0, plant.found.which("E")]
         return np.asarray(np.bincount(i, values * off[j], len(x0)))
 
     missed = differential(z)

@@ -126,6 +126,7 @@ def _solved(
     first = strangeness_free_form(
         system, structure, mesh.points.ravel(), mesh.inside.ravel(), c, points
     )
+    del c  # as much as all that is made of it
     independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
     if independent:
         x0 = ivp.consistent_start(system, structure, start, float(mesh.inside[0, 0]))
