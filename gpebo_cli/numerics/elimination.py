@@ -18,7 +18,6 @@ from gpebo_cli.numerics.mesh import Mesh, equal_lengths
 from gpebo_cli.numerics.problem import at_points
 
 _SMALL = 1e-280  # terms below it have lost digits
-_AT_ONCE = 8  # elements
 _FILL = 4  # blocks of size s × s per state that elimination may couple; with more A is not sparse
 
 
@@ -36,18 +35,11 @@ def by_elimination(
     """
     _, h = equal_lengths(mesh.steps, mesh)
     D, (rows, columns, entries) = mesh.rule.differentiation, A
-    steps, points = steps_of(rows.tobytes(), columns.tobytes()), len(D) + 1
+    steps = steps_of(rows.tobytes(), columns.tobytes())
+    values = elements.stiff(D, h, *steps, entries, f, kicks, start)
     if kicks is None:
-        values = elements.stiff(D, h, *steps, entries, f, None, start)
         return values, _residual(D, h, rows, columns, entries, f, values)
-    ends = np.empty((len(h), 1, *start.shape))
-    for first in range(0, len(h), _AT_ONCE):  # values between ends are as much as all else
-        part = slice(first, first + _AT_ONCE)
-        some = slice(first * points, (first + _AT_ONCE) * points)
-        a, known = (x if len(x) == 1 else x[some] for x in (entries, f))
-        ends[part] = elements.stiff(D, h[part], *steps, a, known, kicks[part], start)[:, -1:]
-        start = (ends[part] + kicks[part, None])[-1, 0]
-    return ends, np.zeros(len(h))
+    return values[:, -1:].copy(), np.zeros(len(h))  # which does not hold the others
 
 
 def _residual(

@@ -11,6 +11,7 @@ full and constant with one factorisation for all elements of one length.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from math import factorial
 from typing import Any, NamedTuple
@@ -39,6 +40,7 @@ _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _TINY = float(np.finfo(float).tiny)
+_AT_ONCE = 4  # elements of which all points are held, where errors are carried
 _FEW_COLUMNS = 4  # whose errors are carried one by one
 
 # Values (K, s + 1, d, c) of x' = A x + f on a mesh, f of the first columns, from a start (d, c),
@@ -367,15 +369,26 @@ def _errors(
     if columns > _FEW_COLUMNS:
         added, start, moved = (x.max(axis=-1, keepdims=True) for x in (added, start, moved))
     signs = random_signs(K, n)[..., None]
-    forcing = np.zeros((1, n, 0))
-    if stiff:
-        slopes = 2.0 * (signs[1:] * (moved / h)[:, :, None]).reshape(K, 1, n, -1)
-        forcing = (rule.points[:, None, None] * slopes).reshape(K * points, n, -1)
     kicks = (signs[1:] * added[:, :, None]).reshape(K, n, -1)
     start = (signs[0] * start[:, None]).reshape(n, -1)
-    ends, change = march(mesh, A, forcing, kicks, start, _ROUGH)
-    kicks[~np.isfinite(change)] = np.inf
-    squares = ((ends[:, -1] + kicks) ** 2).reshape(K, n, -1, added.shape[2])
+    ends, left = np.empty_like(kicks), np.empty(K)
+    count = _AT_ONCE if stiff else K
+    for first in range(0, K, count):
+        part, some = slice(first, first + count), slice(points * first, points * (first + count))
+        forcing = np.zeros((1, n, 0))
+        if stiff:
+            slopes = 2.0 * signs[1:][part] * (moved[part] / h[part])[:, :, None]
+            forcing = rule.points[:, None, None] * slopes.reshape(-1, 1, *start.shape)
+            forcing = forcing.reshape(-1, *start.shape)
+        found_there, left[part] = march(
+            replace(mesh, edges=mesh.edges[first : first + count + 1]),
+            A if len(A.entries) == 1 else A._replace(entries=A.entries[some]),
+            forcing, kicks[part], start, _ROUGH,
+        )
+        ends[part] = found_there[:, -1]
+        start = (ends[part] + kicks[part])[-1]
+    kicks[~np.isfinite(left)] = np.inf
+    squares = ((ends + kicks) ** 2).reshape(K, n, -1, added.shape[2])
     systematic = np.arange(2, K + 2)[:, None, None]
     carried = np.sqrt(systematic * squares.mean(axis=2)) + np.zeros(columns)
     return judged_errors(
