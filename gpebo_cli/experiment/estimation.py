@@ -28,13 +28,7 @@ from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
-from gpebo_cli.experiment.result import (
-    EstimationResult,
-    Fit,
-    NoiseStatistics,
-    RegressionResult,
-    RunResult,
-)
+from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
@@ -135,46 +129,44 @@ def continuous(
     unknown = [
         name for name, is_known in told.items() if not (is_known or name in observation.unseen)
     ]
-    return _completed(
-        result, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation) if source.noisy(levels) else None, _no_deviations(why),
-        noisy=source.noisy(levels), regression=sampled, fit=fit, noise=noise,
-        left_out=observation.unseen,
+    if observation.estimator is not None:  # what the result is labelled with is what estimated
+        settings = replace(settings, estimator={"name": settings.observer["name"]})
+    found = replaced(
+        result, regression=sampled, fit=fit, noise=noise, left_out=observation.unseen,
         estimable=lambda: estimable(excitation.known, t, *names, seen_at(excitation.known)),
-        # What the result is labelled with is what estimated.
-        settings=replace(settings, estimator={"name": settings.observer["name"]})
-        if observation.estimator is not None else settings,
+        settings=settings,
+    )
+    return _completed(
+        found, source, observation, unknown, excitation, estimation, metrics,
+        _gains(observation, estimation), _no_deviations(why), noisy=source.noisy(levels),
     )
 
 
 def _completed(
-    result: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
+    found: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
     excitation: Excitation, estimation: EstimationResult, metrics: Metrics, gains: Array | None,
-    note: str, *, noisy: bool, regression: RegressionResult, fit: Fit | None, settings: Settings,
-    estimable: Callable[[], Mapping[str, float | None]], noise: NoiseStatistics | None = None,
-    left_out: tuple[str, ...] = (),
+    note: str, *, noisy: bool,
 ) -> RunResult:
-    """The result with what observer and estimator made of a source, and what is told of it.
+    """What was ``found`` with the rest that observer and estimator made of a source, and its words.
 
     Nothing is known of the ``unknown`` parameters and states, ``gains`` are as of
     ``accuracy.standing``, and the ``note`` is for the last line of a run, from "; " on.
     """
-    system, simulation, recording = result.system, result.simulation, result.recording
+    system, simulation, recording = found.system, found.simulation, found.recording
     if noisy:
-        metrics = accuracy.standing(estimation, metrics, gains, system, noise)
+        metrics = accuracy.standing(estimation, metrics, gains, system, found.noise)
     # A result that is kept for what it has to tell must not keep what the observer made.
     of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
     of_observer = partial(of_observation, observed.assumptions, growth, excitation, system)
     warned, told = warnings(observed), partial(
-        verdict, excitation, estimation.cases, estimation.requirement, metrics, fit, unknown,
-        left_out, estimation.active,
+        verdict, excitation, estimation.cases, estimation.requirement, metrics, found.fit, unknown,
+        found.left_out, estimation.active,
     )
-    notes = observed.note + note + simulation_note(simulation, result.settings.solver.tol)
+    notes = observed.note + note + simulation_note(simulation, found.settings.solver.tol)
     notes += functions_note(system, simulation or recording)
     notes += recording.note if recording else ""
     return replaced(
-        result, excitation=excitation, estimation=estimation, metrics=metrics, settings=settings,
-        regression=regression, fit=fit, noise=noise, left_out=left_out, estimable=estimable,
+        found, excitation=excitation, estimation=estimation, metrics=metrics,
         assumptions=lambda: (*of_source(), *of_observer()),
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
         warnings=lambda: (*warned, *estimation.warnings),
@@ -313,15 +305,17 @@ def at_samples(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
     rows, noisy = made.regression.rows[1 + chosen], source.noisy(levels)
+    sampled = RegressionResult(
+        t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
+    )
+    found = replaced(
+        result, regression=sampled, fit=online.fit() if source.recording else None,
+        estimable=lambda: times,
+    )
     return _completed(
-        result, source, online, [name for name, since in times.items() if since is None],
+        found, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
         _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy,
-        estimable=lambda: times, settings=settings,
-        regression=RegressionResult(
-            t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
-        ),
-        fit=online.fit() if source.recording else None,
     )
 
 
