@@ -10,9 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from regressions import adjugate
 
+from gpebo_cli.estimators._mixed import determinant_and_adjugate
 from gpebo_cli.numerics.linalg import (
     affine_scan,
     determinant_and_adjugate_action,
+    determinant_and_inverse,
     inverse_or_none,
     largest_over_time,
 )
@@ -38,6 +40,22 @@ def test_mixing_identity():
     omega, eta = rng.normal(size=(50, 4, 4)), rng.normal(size=4)
     det, action, _ = determinant_and_adjugate_action(omega, omega @ eta)
     np.testing.assert_allclose(action, det[:, None] * eta, atol=1e-12 * np.abs(det).max())
+
+
+def test_what_elimination_leaves_few_digits_of_is_left_to_singular_values():
+    rng = np.random.default_rng(3)
+    (U, _, V), sizes = np.linalg.svd(rng.normal(size=(5, 5))), np.ones((4, 5))
+    sizes[:, -1] = [1.0, 1e-9, 1e-14, 0.0]
+    omega = U * sizes[:, None] @ V
+    det, inverse, unclear = determinant_and_inverse(omega)
+    np.testing.assert_array_equal(unclear, [False, False, True, True])
+    assert not inverse[2:].any()
+    np.testing.assert_allclose(inverse[:2] @ omega[:2], [np.eye(5)] * 2, atol=1e-6)
+    np.testing.assert_allclose(det[:2], np.linalg.det(omega[:2]), rtol=1e-6)
+    det, found = determinant_and_adjugate(omega)
+    exact, action, _ = determinant_and_adjugate_action(omega)
+    np.testing.assert_allclose(det, exact, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(found, action, rtol=1e-6, atol=1e-12)
 
 
 @pytest.mark.parametrize("width", [3, 3000])  # prefix scan and plain recurrence

@@ -27,7 +27,7 @@ from gpebo_cli.evidence.knowledge import own_sizes
 from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.errors import EPS
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import determinant_and_inverse, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression, interpolation_error
 from gpebo_cli.regression.resets import ExtensionState, level_of
@@ -38,7 +38,6 @@ _LOOKED = np.geomspace(1e-4, 1.0, 86)  # of the time: there the first data that 
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
-_CLEAR = 1e11  # ‖G_z‖‖G_z⁻¹‖, up to which elimination leaves the digits that deviations need
 _NOTHING = 1e-2  # in units of rounding: an eigenvalue that is zero
 _PRIOR = 1e-3  # of what may be rounding stands for an f₀ that nobody gave
 CLEAR = 1e-8  # λ_min/λ_max, from which on the units that are given cost no digits worth a word
@@ -157,13 +156,10 @@ class InformationAt:
 
         With H⁻¹ = I + z f₀ (α G_z)⁻¹, by elimination; by the spectrum where that has no digits.
         """
-        G = self._gram(self.units)
-        eye = np.broadcast_to(np.eye(G.shape[1]), G.shape)
-        _, inverse, condition = laws.mixed(np.concatenate([G, eye], axis=2), None)
-        rest = ~(condition < _CLEAR)
-        inverse[rest] = 0.0
-        delta = 1.0 / np.linalg.det(eye + (self.memory * (f0 / alpha))[:, None, None] * inverse)
-        adjugate, digits = delta[:, None, None] * inverse, np.ones(len(G))
+        _, inverse, rest = determinant_and_inverse(self._gram(self.units))
+        added = (self.memory * (f0 / alpha))[:, None, None] * inverse
+        delta = 1.0 / np.linalg.det(np.eye(added.shape[1]) + added)
+        adjugate, digits = delta[:, None, None] * inverse, np.ones(len(delta))
         if self.units is not None:
             adjugate /= self.units[..., None] * self.units[:, None]
         if rest.any():

@@ -8,14 +8,17 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from gpebo_cli import kernels
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, Mixed, ScalarLaw, mix_sampled
 from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import determinant_and_adjugate_action, transpose
+from gpebo_cli.numerics.linalg import (
+    determinant_and_adjugate_action,
+    determinant_and_inverse,
+    transpose,
+)
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Lasting, SampledEstimates
@@ -23,8 +26,6 @@ from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
-
-_CLEAR = 1e11  # ‖Ω‖‖Ω⁻¹‖, up to which elimination leaves more digits than deviations need
 
 
 def filter_rates(rates: object, parameters: Sequence[str]) -> Array:
@@ -108,14 +109,8 @@ class FilteredEstimator(ResumableEstimator):
 
 
 def determinant_and_adjugate(omega: Array) -> tuple[Array, Array]:
-    """det(Ω) (N,) and adj(Ω) of Ω (N, p, p): by elimination, and by its SVD where that is rounding.
-
-    Deviations need three digits, and SVDs are most of the time that they take.
-    """
-    extended = np.concatenate([omega, np.broadcast_to(np.eye(omega.shape[1]), omega.shape)], axis=2)
-    delta, inverse, condition = kernels.laws.mixed(extended, None)
-    rest = ~(condition < _CLEAR)
-    inverse[rest] = 0.0
+    """det(Ω) (N,) and adj(Ω) of Ω (N, p, p) by elimination, or its SVD where that is rounding."""
+    delta, inverse, rest = determinant_and_inverse(omega)
     adjugate = delta[:, None, None] * inverse
     delta[rest], adjugate[rest], _ = determinant_and_adjugate_action(omega[rest])
     return delta, adjugate

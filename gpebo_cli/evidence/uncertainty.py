@@ -153,7 +153,7 @@ class _Chain:
 
     rate = 0.0  # in 1/s, the fastest one of what errors of samples move directly
     zeta = 0  # how many ζ are
-    unknown: bool | None = None  # whether C is NaN at the start
+    unknown = False  # whether C is NaN at the start
 
     def __init__(
         self, observer: ErrorsAt, estimator: ErrorsAt, n: int, groups: Groups, variances: Array,
@@ -181,7 +181,7 @@ class _Chain:
     def looked(self, mesh: Mesh, t: Array) -> tuple[Mesh, ErrorSystem]:
         """The next elements with layers where times t (M,) are, and their joint system."""
         joint, o = _joint(self._observer, *self._behind, mesh, slice(None))
-        if self.unknown is None:
+        if self._group < 0:
             self.unknown = bool(np.isnan(joint.C[0]).any())
         self.zeta, alike = o.A.shape[1], all(len(part) == 1 for part in o)
         self.observer = (lambda *_: o) if alike else self._observer

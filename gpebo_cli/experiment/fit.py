@@ -75,14 +75,15 @@ def _follows(residual: Array, inputs: Array) -> bool:
     from scipy.special import fdtrc
 
     each = -(-len(residual) // _AT_MOST)
-    count = len(residual) // each
-    r, u = (x[: count * each].reshape(count, each, x.shape[1]).mean(axis=1)
-            for x in (residual, inputs))
+    whole = len(residual) // each * each
+    r, u = (
+        x[:whole].reshape(whole // each, each, x.shape[1]).mean(axis=1) for x in (residual, inputs)
+    )
     ago = np.append(0, 2 ** np.arange((len(r) // 8).bit_length()))
     past = np.hstack([u[ago[-1] - k : len(u) - k] for k in ago])
     r, moving = r[ago[-1] :] - r[ago[-1] :].mean(axis=0), past - past.mean(axis=0)
-    size, whole = (np.linalg.norm(x, axis=0) for x in (moving, past))
-    some = size > _SILENT * whole
+    size = np.linalg.norm(moving, axis=0)
+    some = size > _SILENT * np.linalg.norm(past, axis=0)
     basis, sizes, _ = np.linalg.svd(moving[:, some] / size[some], full_matrices=False)
     basis = basis[:, sizes > _FAINT * sizes.max(initial=0.0)]
     count, free = basis.shape[1], len(r) - basis.shape[1] - 1
