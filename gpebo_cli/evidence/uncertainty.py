@@ -543,7 +543,7 @@ class SampledDeviations:
         """
         self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
         self.noisy = variances > 0.0  # (m + r,)
-        self._factors: list[Array] = []  # L of [ζ; e; s] of each case
+        self._factors: list[tuple[Array, int]] = []  # L of [ζ; e; s] of each case, and its columns
         self._before: tuple[Array, Array] | None = None  # C and D of the last sample
         self._last = -np.inf
         self._expected, self._square = 0.0, 0.0  # E∫|δY|² so far, E|δY|² at the last sample
@@ -587,7 +587,7 @@ class SampledDeviations:
             M[:, k + signals :, both] = case.old @ Y_old + case.new @ Y_new
             M[:, k + signals :, k + signals : size] = case.A
             if len(self._factors) <= g:
-                self._factors.append(np.zeros((size, size)))
+                self._factors.append((np.zeros((size, size)), size))
             L = self._recursion(g, M, fresh, slice(k, k + signals))
             eta = case.C @ L[:, k + signals :]
             own = eta[:, -p:]
@@ -599,20 +599,25 @@ class SampledDeviations:
         return out, level if self._relative else np.ones(count)
 
     def _recursion(self, g: int, M: Array, fresh: BoolArray, errors: slice) -> Array:
-        """L of one case at the samples, (K, d, d), from [z; e'] to z' (K, d, d + signals)."""
-        L, size = self._factors[g], M.shape[1]
-        out = np.empty((len(M), size, size))
-        new = np.diag(self._deviations)
-        for i, step in enumerate(M):
-            if fresh[i]:
-                wide = np.hstack([step[:, :size] @ L, step[:, size:] @ new])
-                L = np.asarray(np.linalg.qr(wide.T, mode="r")).T
-            else:  # the errors are those of the sample before
-                same = step[:, :size].copy()
-                same[:, errors] += step[:, size:]
-                L = same @ L
-            out[i] = L
-        self._factors[g] = L
+        """L of one case at the samples, (K, d, ·), from [z; e'] to z' (K, d, d + signals).
+
+        The errors of several samples stand side by side, before it is made triangular again.
+        """
+        size, signals = M.shape[1], len(self._deviations)
+        A, new = M[:, :, :size], M[:, :, size:]
+        A[~fresh, :, errors] += new[~fresh]  # the errors are those of the sample before
+        new = new * self._deviations
+        out = np.zeros((len(M), size, size + _BESIDE * signals))
+        L, used = self._factors[g]
+        for k, own in enumerate(fresh.tolist()):
+            if own and used == out.shape[2]:
+                L, used = np.asarray(np.linalg.qr(L.T, mode="r")).T, size
+            np.matmul(A[k], L[:, :used], out=out[k, :, :used])
+            if own:
+                out[k, :, used : used + signals] = new[k]
+                used += signals
+            L = out[k]
+        self._factors[g] = L.copy(), used
         return out
 
     def _level(

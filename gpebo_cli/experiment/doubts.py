@@ -65,9 +65,9 @@ def moved_by_noise(
     """
     own = std[..., : parameters.shape[2]]
     out: BoolArray = np.asarray(own.any(axis=2))
-    for k in [] if met is None else np.flatnonzero(~met):
-        away = np.abs(parameters[:, k] - least_squares(roots[k]))
-        out[:, k] &= (away <= _BEYOND * own[:, k]).all(axis=1)
+    if met is not None and not met.all():
+        away = np.abs(parameters[:, ~met] - least_squares(roots[~met]))
+        out[:, ~met] &= (away <= _BEYOND * own[:, ~met]).all(axis=2)
     return out
 
 

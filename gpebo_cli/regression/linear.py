@@ -275,10 +275,11 @@ def interpolation_error(gram: Trajectory, element: IntArray, share: Array) -> Ar
 
 
 def least_squares(root: Array) -> Array:
-    """η̂ (p,) that makes |R [−η̂; 1]| least, R (k, p + 1); the smallest one where many do."""
-    size = np.linalg.norm(root[:, :-1], axis=0)
+    """η̂ (…, p) that makes |R [−η̂; 1]| least, R (…, k, p + 1); the smallest one where many do."""
+    size = np.linalg.norm(root[..., :-1], axis=-2)
     size = np.where(size > 0.0, size, 1.0)
-    return np.asarray(np.linalg.lstsq(root[:, :-1] / size, root[:, -1], rcond=_SINGULAR)[0] / size)
+    inverse = np.linalg.pinv(root[..., :-1] / size[..., None, :], rcond=_SINGULAR)
+    return np.asarray((inverse @ root[..., -1:])[..., 0] / size)
 
 
 def outer_products(psi: Array, Y: Array) -> Array:
