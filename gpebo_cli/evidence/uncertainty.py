@@ -112,30 +112,29 @@ def _propagated(
         part, maps, factors, (common, varies) = chain.along(part, joint, t[chosen])
         if not len(chosen):
             continue
-        zeta, size, signals = chain.zeta, maps.shape[2], len(variances)
+        zeta, size, own = chain.zeta, maps.shape[2], np.arange(len(variances))
         sampler = part.sampler(t[chosen])
         element, places = sampler.element, sampler.weights
         before, group = factors[element], _group_of(part, groups.starts)[element]
-        here = Sampler(element, places[:, 1:])(maps)
-        np.einsum("mii->mi", here[:, :, :size])[...] += places[:, :1]
-        reached = here @ before  # of [ζ; s] (M, size, ·)
-        inside = part.inside[element, 1]
-        o = chain.observer(t[chosen], inside)
-        eta = common @ reached[:, zeta:]
-        if len(own_C := varies[element].nonzero()[0]):
-            C = estimator(t[chosen][own_C], inside[own_C]).C
-            eta[own_C] = C @ reached[own_C, zeta:]
-        rows = o.C.shape[1] - n  # of Y; those of the offset stand below
+        here = np.zeros((len(chosen), size + len(own), before.shape[1]))  # of [ζ; s; e]
+        here[:, :size] = Sampler(element, places[:, 1:])(maps)
+        np.einsum("mii->mi", here[:, :size, :size])[...] += places[:, :1]
         now = groups.weights(t[chosen], group, groups.after)
         if not groups.alone:  # errors of one row and the one behind it, not of many
             now = now / chain.shares[group].T
-        e_now = sum(
-            each[:, None, None] * before[:, size + k * signals : size + (k + 1) * signals]
-            for k, each in enumerate(now)
-        )
-        x = gain[chosen] @ eta
-        x += o.C[:, rows:] @ reached[:, :zeta] + o.D[:, rows:] @ e_now
-        of_eta[chosen], of_x[chosen] = _sizes(eta), _sizes(x)
+        for k, each in enumerate(now):
+            here[:, size + own, size + k * len(own) + own] = each[:, None]
+        inside = part.inside[element, 1]
+        C = common[None].repeat(len(chosen), axis=0)
+        if len(others := varies[element].nonzero()[0]):
+            C[others] = estimator(t[chosen][others], inside[others]).C
+        o = chain.observer(t[chosen], inside)
+        rows = o.C.shape[1] - n  # of Y; those of the offset stand below
+        out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
+        out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
+        out[:, p:, :zeta], out[:, p:, size:] = o.C[:, rows:], o.D[:, rows:]
+        found = _sizes(out @ here @ before)
+        of_eta[chosen], of_x[chosen] = found[:, :p], found[:, p:]
     if chain.unknown:  # one row alone says nothing of that, but rounding does
         row = groups.after[0] - groups.starts[0]
         for each in (of_eta, of_x):
