@@ -13,6 +13,7 @@ orthogonal transformations: no variance can become negative, whatever the roundi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -421,20 +422,61 @@ def _group_of(mesh: Mesh, instants: Array) -> IntArray:
 def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     """z at each node from that at the left end and from e, z' = A z + B e; (K, s, d, d + c).
 
-    A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,).
+    A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,). Errors
+    go from ζ to filters and from there to the law: A is block triangular, and solved by its blocks.
     """
-    K, E = len(steps), None
+    K, s, d, c = B.shape
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
     # Beside the rows of a law with a large gain those of its filters would be rounding.
-    if size.max(initial=0.0) > _STIFF:
-        A, B = (x / size[:, None, :, None] for x in (A, B))
-        E = (np.eye(A.shape[-1]) / size[:, None]).repeat(1 + A.shape[1], axis=0)
-    # At the left ends nothing is looked at.
-    A, B = (np.concatenate([x[:, :1], x], axis=1) for x in (A, B))
-    A, B = (x.reshape(K * x.shape[1], *x.shape[2:]) for x in (A, B))
-    return np.concatenate(elements.element_maps(
-        mesh.rule.differentiation, steps, E, A, B, None, None, np.arange(K), K
-    ), axis=3)
+    stiff, weights = size.max(initial=0.0) > _STIFF, 1.0 / size[:, None, :, None]
+    out = np.zeros((K, s, d, d + c))
+    for first, groups, width in _blocks((A != 0.0).any(axis=(0, 1))):
+        last = first + groups * width
+        left, own = A[:, :, first:last, :first], A[:, :, first:last, first:last]
+        e = left @ out[:, :, :first, d:] + B[:, :, first:last]
+        f = np.concatenate([left @ out[:, :, :first, :first], e], axis=3)
+        E = None
+        if stiff:
+            own, f = (weights[:, :, first:last] * x for x in (own, f))
+            E = weights[:, 0, first:last].reshape(-1, 1, width, 1) * np.eye(width)
+            E = E.repeat(1 + s, axis=1).reshape(-1, width, width)
+        each = K, s, groups, width
+        homogeneous, particular = elements.element_maps(
+            mesh.rule.differentiation, steps.repeat(groups), E, *(
+                # At the left ends nothing is looked at.
+                np.concatenate([x[:, :, :1], x], axis=2).reshape(-1, width, x.shape[4]) for x in (
+                    np.einsum("ksgvgw->kgsvw", own.reshape(*each, groups, width)),
+                    np.moveaxis(f.reshape(*each, -1), 2, 1),
+                )
+            ), None, None, np.arange(K * groups), K * groups,
+        )
+        found = np.moveaxis(particular.reshape(K, groups, s, width, -1), 1, 2)
+        found = found.reshape(K, s, last - first, -1)
+        out[:, :, first:last, :first], out[:, :, first:last, d:] = np.split(found, [first], axis=3)
+        found = np.zeros((*each, groups, width))
+        np.einsum("ksgvgw->kgsvw", found)[...] = homogeneous.reshape(K, groups, s, width, width)
+        out[:, :, first:last, first:last] = found.reshape(K, s, last - first, last - first)
+    return out
+
+
+def _blocks(reaches: BoolArray) -> list[tuple[int, int, int]]:
+    """Where the diagonal blocks of a triangular matrix begin, how many stand there, how wide.
+
+    What ``reaches`` (d, d) a row is true in it. Rows that do not reach each other are blocks of
+    width 1.
+    """
+    d = len(reaches)
+    last = np.maximum.accumulate(np.where(reaches, np.arange(d), 0).max(axis=1, initial=0))
+    ends = np.flatnonzero(last <= np.arange(d)) + 1
+    found: list[tuple[int, int, int]] = []
+    for first, end in pairwise([0, *ends.tolist()]):
+        if found and end == first + 1 and found[-1][2] == 1:
+            begun, groups, _ = found[-1]
+            if not reaches[first, begun:first].any():
+                found[-1] = begun, groups + 1, 1
+                continue
+        found.append((first, 1, end - first))
+    return found
 
 
 def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) -> Array:
