@@ -25,7 +25,7 @@ from gpebo_cli.errors import SolverError, check_memory
 from gpebo_cli.estimators._scalar import MAX_ELEMENTS, SINGULAR, low_pass
 from gpebo_cli.evidence.knowledge import own_sizes
 from gpebo_cli.kernels import laws
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import determinant_and_inverse, transpose
 from gpebo_cli.numerics.mesh import Trajectory
@@ -163,12 +163,28 @@ class InformationAt:
         if self.units is not None:
             adjugate /= self.units[..., None] * self.units[:, None]
         if rest.any():
-            own = None if self.units is None else self.units[rest]
-            s = InformationAt(self.values[rest], self.memory[rest], own).spectrum
+            s = self._some(rest).spectrum
             delta[rest], weights = s.adjugate(alpha, f0)
             adjugate[rest] = (s.vectors * weights[:, None]) @ transpose(s.vectors)
             digits[rest] = s.digits
         return delta, adjugate, digits
+
+    def covariance(self, alpha: float, f0: float) -> Array:
+        """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p), by elimination; as in :class:`Spectrum` else."""
+        G, prior = self._gram(self.units), self.memory * f0
+        _, found, rest = determinant_and_inverse(alpha * G + prior[:, None, None] * np.eye(len(G[0])))
+        if self.units is not None:
+            size = np.linalg.norm(found, axis=(1, 2))
+            rest |= size * (prior + alpha * _NOTHING) > 1.0  # an eigenvalue of G_z may be nothing
+            found /= self.units[..., None] * self.units[:, None]
+        found *= alpha
+        if rest.any():
+            found[rest] = self._some(rest).spectrum.covariance(alpha, f0)
+        return found
+
+    def _some(self, chosen: BoolArray) -> InformationAt:
+        units = None if self.units is None else self.units[chosen]
+        return InformationAt(self.values[chosen], self.memory[chosen], units)
 
     def forgetting(self, alpha: float, f0: float, beta: float, bound: float | None) -> Array:
         """β, or β (1 − ‖F‖/M) with a bound M, (M,)."""

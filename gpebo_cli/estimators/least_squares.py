@@ -90,7 +90,7 @@ class LeastSquares(ResumableEstimator):
             here, into = info.at(t, inside), transpose(regression.psi(t, inside))
             rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], self.covariance_bound)
             A = -rate[:, None, None] * np.eye(regression.p)
-            C = here.spectrum.covariance(case["alpha"], f0_of(case))
+            C = here.covariance(case["alpha"], f0_of(case))
             return ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
 
         infos = self.informations(regression, known)
