@@ -9,6 +9,7 @@ import pytest
 import yaml
 from examples import ROOT
 from plants import one_state, shipped
+from scipy.linalg import expm
 
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
@@ -509,6 +510,26 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
     (f, s), decayed = _maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
     np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("apart", [True, False])
+@pytest.mark.parametrize("widths", [[6], [2, 1, 1, 1, 2], [1] * 4, [1, 3, 1, 1], [0]])
+def test_elements_solved_block_by_block_are_those_of_the_whole_system(widths, apart):
+    """exp of the system beside its errors; rows of width 1 that follow each other are apart."""
+    rng, d = np.random.default_rng(len(widths)), sum(widths)
+    A, ends = rng.normal(size=(d, d)), np.cumsum(widths)
+    for first, width in zip(ends - widths, widths, strict=True):
+        A[first : first + width, first + width :] = 0.0
+    singles = np.repeat(widths, widths) == 1
+    A[apart & np.outer(singles, singles) & ~np.eye(d, dtype=bool)] = 0.0
+    B, mesh = rng.normal(size=(d, 2)), Mesh(np.array([0.0, 0.1, 0.3]), radau_rule(6))
+    found = _maps(mesh, mesh.steps, *(np.broadcast_to(x, (2, 6, *x.shape)) for x in (A, B)))
+    whole = np.zeros((d + 2, d + 2))
+    whole[:d] = np.hstack([A, B])
+    for element in range(2):
+        for node, t in enumerate(mesh.points[element, 1:] - mesh.edges[element]):
+            exact = expm(t * whole)[:d]
+            np.testing.assert_allclose(found[element, node], exact, rtol=0, atol=1e-7)
 
 
 def noisy_battery():

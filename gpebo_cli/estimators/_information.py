@@ -172,7 +172,8 @@ class InformationAt:
     def covariance(self, alpha: float, f0: float) -> Array:
         """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p), by elimination; as in :class:`Spectrum` else."""
         G, prior = self._gram(self.units), self.memory * f0
-        _, found, rest = determinant_and_inverse(alpha * G + prior[:, None, None] * np.eye(len(G[0])))
+        added = prior[:, None, None] * np.eye(G.shape[1])
+        _, found, rest = determinant_and_inverse(alpha * G + added)
         if self.units is not None:
             size = np.linalg.norm(found, axis=(1, 2))
             rest |= size * (prior + alpha * _NOTHING) > 1.0  # an eigenvalue of G_z may be nothing
