@@ -425,38 +425,52 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,). Errors
     go from ζ to filters and from there to the law: A is block triangular, and solved by its blocks.
     """
-    K, s, d, c = B.shape
+    d, c = B.shape[2:]
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
     # Beside the rows of a law with a large gain those of its filters would be rounding.
     stiff, weights = size.max(initial=0.0) > _STIFF, 1.0 / size[:, None, :, None]
-    out = np.zeros((K, s, d, d + c))
-    for first, groups, width in _blocks((A != 0.0).any(axis=(0, 1))):
-        last = first + groups * width
-        left, own = A[:, :, first:last, :first], A[:, :, first:last, first:last]
-        e = left @ out[:, :, :first, d:] + B[:, :, first:last]
-        f = np.concatenate([left @ out[:, :, :first, :first], e], axis=3)
-        E = None
+    out = np.zeros((*B.shape[:3], d + c))
+    for first, count, width in _blocks((A != 0.0).any(axis=(0, 1))):
+        part = slice(first, first + count * width)
+        left, before, own = A[:, :, part, :first], out[:, :, :first], A[:, :, part, part]
+        e = left @ before[..., d:] + B[:, :, part]
+        f, E = np.concatenate([left @ before[..., :first], e], axis=3), None
         if stiff:
-            own, f = (weights[:, :, first:last] * x for x in (own, f))
-            E = weights[:, 0, first:last].reshape(-1, 1, width, 1) * np.eye(width)
-            E = E.repeat(1 + s, axis=1).reshape(-1, width, width)
-        each = K, s, groups, width
-        homogeneous, particular = elements.element_maps(
-            mesh.rule.differentiation, steps.repeat(groups), E, *(
-                # At the left ends nothing is looked at.
-                np.concatenate([x[:, :, :1], x], axis=2).reshape(-1, width, x.shape[4]) for x in (
-                    np.einsum("ksgvgw->kgsvw", own.reshape(*each, groups, width)),
-                    np.moveaxis(f.reshape(*each, -1), 2, 1),
-                )
-            ), None, None, np.arange(K * groups), K * groups,
-        )
-        found = np.moveaxis(particular.reshape(K, groups, s, width, -1), 1, 2)
-        found = found.reshape(K, s, last - first, -1)
-        out[:, :, first:last, :first], out[:, :, first:last, d:] = np.split(found, [first], axis=3)
-        found = np.zeros((*each, groups, width))
-        np.einsum("ksgvgw->kgsvw", found)[...] = homogeneous.reshape(K, groups, s, width, width)
-        out[:, :, first:last, first:last] = found.reshape(K, s, last - first, last - first)
+            E = weights[:, :, part]
+            own, f = E * own, E * f
+        out[:, :, part, part], found = _solved(mesh, steps, E, own, f, count)
+        out[:, :, part, :first], out[:, :, part, d:] = found[..., :first], found[..., first:]
     return out
+
+
+def _solved(
+    mesh: Mesh, steps: Array, E: Array | None, A: Array, f: Array, count: int
+) -> tuple[Array, Array]:
+    """z at each node from that at the left end (K, s, m, m), and from zero (K, s, m, c).
+
+    E z' = A z + f with a diagonal E (K, 1, m, 1), None for the identity. A (K, s, m, m) consists of
+    ``count`` diagonal blocks.
+    """
+    K, s, m, c = f.shape
+    width, own = m // count, np.zeros(A.shape)
+    by_block = K, s, count, width, count, width
+    apart = np.einsum("ksgvgw->kgsvw", A.reshape(by_block))
+    given = f.reshape(*by_block[:4], c).swapaxes(1, 2)
+    # At the left ends nothing is looked at.
+    apart, given = (
+        np.concatenate([x[:, :, :1], x], axis=2).reshape(-1, *x.shape[3:]) for x in (apart, given)
+    )
+    if E is not None:
+        E = (E.reshape(-1, 1, width, 1) * np.eye(width)).repeat(1 + s, axis=1)
+        E = E.reshape(-1, width, width)
+    homogeneous, particular = elements.element_maps(
+        mesh.rule.differentiation, steps.repeat(count), E, apart, given, None, None,
+        np.arange(K * count), K * count,
+    )
+    np.einsum("ksgvgw->kgsvw", own.reshape(by_block))[...] = homogeneous.reshape(
+        K, count, s, width, width
+    )
+    return own, particular.reshape(K, count, s, width, c).swapaxes(1, 2).reshape(f.shape)
 
 
 def _blocks(reaches: BoolArray) -> list[tuple[int, int, int]]:
