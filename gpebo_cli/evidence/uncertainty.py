@@ -429,18 +429,19 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
     # Beside the rows of a law with a large gain those of its filters would be rounding.
     stiff, weights = size.max(initial=0.0) > _STIFF, 1.0 / size[:, None, :, None]
-    out = np.zeros((*B.shape[:3], d + c))
+    out = np.zeros((*B.shape[:3], c + d))  # from e first
     for first, count, width in _blocks((A != 0.0).any(axis=(0, 1))):
         part = slice(first, first + count * width)
-        left, before, own = A[:, :, part, :first], out[:, :, :first], A[:, :, part, part]
-        e = left @ before[..., d:] + B[:, :, part]
-        f, E = np.concatenate([left @ before[..., :first], e], axis=3), None
+        f, own, E = A[:, :, part, :first] @ out[:, :, :first, : c + first], A[:, :, part, part], None
+        f[..., :c] += B[:, :, part]
         if stiff:
             E = weights[:, :, part]
             own, f = E * own, E * f
-        out[:, :, part, part], found = _solved(mesh, steps, E, own, f, count)
-        out[:, :, part, :first], out[:, :, part, d:] = found[..., :first], found[..., first:]
-    return out
+        within = slice(c + part.start, c + part.stop)
+        out[:, :, part, within], out[:, :, part, : c + first] = _solved(
+            mesh, steps, E, own, f, count
+        )
+    return np.concatenate([out[..., c:], out[..., :c]], axis=3)
 
 
 def _solved(
