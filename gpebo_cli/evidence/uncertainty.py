@@ -432,7 +432,8 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     out = np.zeros((*B.shape[:3], c + d))  # from e first
     for first, count, width in _blocks((A != 0.0).any(axis=(0, 1))):
         part = slice(first, first + count * width)
-        f, own, E = A[:, :, part, :first] @ out[:, :, :first, : c + first], A[:, :, part, part], None
+        own, E = A[:, :, part, part], None
+        f = A[:, :, part, :first] @ out[:, :, :first, : c + first]
         f[..., :c] += B[:, :, part]
         if stiff:
             E = weights[:, :, part]
