@@ -51,7 +51,8 @@ _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
 _BESIDE = 8  # errors that stand beside each other in a factor
 _ROWS = 1 << 15  # that are looked at at once
-_STIFF = 1e12  # rates times steps, from which on rows count alike
+_STIFF = 1e6  # rates times steps, from which on rows count alike
+_SMALL = 15  # errors, up to which one system costs less than its blocks
 _SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
@@ -428,33 +429,35 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     d, c = B.shape[2:]
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
     # Beside the rows of a law with a large gain those of its filters would be rounding.
-    stiff, weights = size.max(initial=0.0) > _STIFF, 1.0 / size[:, None, :, None]
+    weights = 1.0 / size[:, None, :, None] if size.max(initial=0.0) > _STIFF else None
+    if 0 < d <= _SMALL:
+        return np.concatenate(_solved(mesh, steps, weights, A, B, 1), axis=3)
     out = np.zeros((*B.shape[:3], c + d))  # from e first
     for first, count, width in _blocks((A != 0.0).any(axis=(0, 1))):
         part = slice(first, first + count * width)
-        own, E = A[:, :, part, part], None
         f = A[:, :, part, :first] @ out[:, :, :first, : c + first]
         f[..., :c] += B[:, :, part]
-        if stiff:
-            E = weights[:, :, part]
-            own, f = E * own, E * f
-        within = slice(c + part.start, c + part.stop)
+        within, own = slice(c + part.start, c + part.stop), A[:, :, part, part]
         out[:, :, part, within], out[:, :, part, : c + first] = _solved(
-            mesh, steps, E, own, f, count
+            mesh, steps, weights if weights is None else weights[:, :, part], own, f, count
         )
     return np.concatenate([out[..., c:], out[..., :c]], axis=3)
 
 
 def _solved(
-    mesh: Mesh, steps: Array, E: Array | None, A: Array, f: Array, count: int
+    mesh: Mesh, steps: Array, weights: Array | None, A: Array, f: Array, count: int
 ) -> tuple[Array, Array]:
     """z at each node from that at the left end (K, s, m, m), and from zero (K, s, m, c).
 
-    E z' = A z + f with a diagonal E (K, 1, m, 1), None for the identity. A (K, s, m, m) consists of
-    ``count`` diagonal blocks.
+    z' = A z + f, its rows multiplied by ``weights`` (K, 1, m, 1), None: 1. A (K, s, m, m) consists
+    of ``count`` diagonal blocks.
     """
     K, s, m, c = f.shape
-    width, own = m // count, np.zeros(A.shape)
+    width, own, E = m // count, np.zeros(A.shape), None
+    if weights is not None:
+        A, f = weights * A, weights * f
+        E = (weights.reshape(-1, 1, width, 1) * np.eye(width)).repeat(1 + s, axis=1)
+        E = E.reshape(-1, width, width)
     by_block = K, s, count, width, count, width
     apart = np.einsum("ksgvgw->kgsvw", A.reshape(by_block))
     given = f.reshape(*by_block[:4], c).swapaxes(1, 2)
@@ -462,9 +465,6 @@ def _solved(
     apart, given = (
         np.concatenate([x[:, :, :1], x], axis=2).reshape(-1, *x.shape[3:]) for x in (apart, given)
     )
-    if E is not None:
-        E = (E.reshape(-1, 1, width, 1) * np.eye(width)).repeat(1 + s, axis=1)
-        E = E.reshape(-1, width, width)
     homogeneous, particular = elements.element_maps(
         mesh.rule.differentiation, steps.repeat(count), E, apart, given, None, None,
         np.arange(K * count), K * count,
