@@ -51,7 +51,12 @@ def kreisselmeier(
     Λ = diag(``rates``): one filter λ_i/(p + λ_i) per row, as in the paper (Section V); all rates
     equal is the classical extension. Since Λ multiplies rows, Ω η = 𝒴 holds for any rates.
     """
-    return low_pass(regression.outer, rates[:, None], start)
+    if start is not None:
+        return low_pass(regression.outer, rates[:, None], start)
+    made, key = regression.filtered, rates.tobytes()
+    if key not in made:
+        made[key] = low_pass(regression.outer, rates[:, None])
+    return made[key]
 
 
 def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Trajectory:

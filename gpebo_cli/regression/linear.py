@@ -87,6 +87,11 @@ class LinearRegression:
         return Trajectory(self.mesh, outer_products(self.psi.values, self.Y.values))
 
     @cached_property
+    def filtered(self) -> dict[bytes, Trajectory]:
+        """:attr:`outer` behind filters that start at zero, by their rates: deviations ask again."""
+        return {}
+
+    @cached_property
     def gram(self) -> Trajectory:
         """[G | h] with G(t) = ∫ψᵀψ, h(t) = ∫ψᵀY from the start, shape (p, p + c).
 
