@@ -64,6 +64,8 @@ class Information:
     @cached_property
     def told(self) -> float:
         """When rounding no longer decides what G_z⁻¹h_z is, in seconds since ``began``, or ∞."""
+        if self.units is None:
+            return 0.0
         start, end = self.gram.mesh.edges[[0, -1]].tolist()
         t = np.append(start, start + (end - start) * _LOOKED)
         known = self.at(t).spectrum.digits > SINGULAR
@@ -151,12 +153,14 @@ class InformationAt:
         _, found, _ = laws.mixed(values, self.memory * (f0 / alpha))
         return np.asarray(found / unit + start[:, None])
 
-    def mixing(self, alpha: float, f0: float) -> tuple[Array, Array, Array]:
+    def mixing(self, alpha: float, f0: float, asked: BoolArray) -> tuple[Array, Array, Array]:
         """Δ = det H (M,), adj(H) αF = Δ G_z⁻¹ (M, p, p), and digits where they may be few (M,).
 
-        With H⁻¹ = I + z f₀ (α G_z)⁻¹, by elimination; by the spectrum where that has no digits.
+        With H⁻¹ = I + z f₀ (α G_z)⁻¹, by elimination; by the spectrum where that has no digits and
+        somebody ``asked`` (M,).
         """
         _, inverse, rest = determinant_and_inverse(self._gram(self.units))
+        rest &= asked
         added = (self.memory * (f0 / alpha))[:, None, None] * inverse
         delta = 1.0 / np.linalg.det(np.eye(added.shape[1]) + added)
         adjugate, digits = delta[:, None, None] * inverse, np.ones(len(delta))

@@ -95,12 +95,13 @@ class LsDrem(ResumableEstimator):
             rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
             if self.gamma is None:
                 gain = gain * one_over_memory(t, case["beta"], info.began)[:, None]
-            delta, adjugate, digits = here.mixing(case["alpha"], f0_of(case))
+            elapsed = t - info.began
+            followed = elapsed >= _WITHOUT * info.told
+            delta, adjugate, digits = here.mixing(case["alpha"], f0_of(case), followed)
             rates = np.broadcast_to(rate[:, None], adjugate.shape[:2])
             if here.units is None:
                 return scalar_errors(rates, into, delta, adjugate, gain)
-            elapsed = t - info.began
-            delta[(digits <= SINGULAR) | (elapsed < _WITHOUT * info.told)] = 0.0
+            delta[(digits <= SINGULAR) | ~followed] = 0.0
             found = scalar_errors(rates, into, delta, adjugate, gain)
             unknown = (digits <= SINGULAR) | (elapsed < _FORGOTTEN * info.told)
             return found._replace(C=np.where(unknown[:, None, None], np.nan, found.C))
