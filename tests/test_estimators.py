@@ -17,7 +17,7 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
-from gpebo_cli.estimators._information import information
+from gpebo_cli.estimators._information import InformationAt, information
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
@@ -912,3 +912,18 @@ def test_an_estimator_that_is_not_resolved_names_what_would_help(monkeypatch):
     monkeypatch.setattr("gpebo_cli.estimators._vector._MAX_ELEMENTS", 2)
     with pytest.raises(SolverError, match="lower its gain, or use estimator=least_squares"):
         gpebo_cli.run("circuit", estimator="gradient", gamma=1e4)
+
+
+@pytest.mark.parametrize("units", [None, 1e-3])
+def test_the_covariance_by_elimination_is_that_of_the_spectrum(units):
+    """Of G with few digits, or none in a direction, with f₀ or without (units of rounding)."""
+    vectors = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    sizes = np.array([[4.0, 2.0, 1.0], [4.0, 2.0, 1e-4], [4.0, 2.0, 1e-14], [4.0, 0.0, 0.0]])
+    G = (vectors * sizes[:, None]) @ vectors.T
+    of_all = None if units is None else np.full((4, 3), units)
+    info = InformationAt(np.concatenate([G, G[:, :, :1]], axis=2), np.ones(4), of_all)
+    own = 1.0 if units is None else units**2
+    known = sizes / own > 1e-2 if units else np.ones_like(sizes, dtype=bool)
+    share = np.where(known, 2.0 / (2.0 * sizes + 0.5 * own), 0.0)
+    expected = (vectors * share[:, None]) @ vectors.T
+    np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)

@@ -600,7 +600,7 @@ class SampledDeviations:
         """
         self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
         self.noisy = variances > 0.0  # (m + r,)
-        self._factors: list[tuple[Array, int]] = []  # L of [ζ; e; s] of each case, and its columns
+        self._factors: list[tuple[Array, int]] = []  # L of [ζ; e; s] of each case, how wide
         self._before: tuple[Array, Array] | None = None  # C and D of the last sample
         self._last = -np.inf
         self._expected, self._square = 0.0, 0.0  # E∫|δY|² so far, E|δY|² at the last sample
