@@ -92,6 +92,7 @@ def test_an_unsolvable_plant_stops_at_the_first_assumption():
 def test_growth_of_the_fundamental_matrix_is_reported():
     names = found(plant_from_mapping(one_state(A=[[1]])))
     assert names["Growth of Φ"].evidence["largest_entry"] == pytest.approx(np.exp(20), rel=1e-9)
+    assert names["Growth of Φ"].evidence["rate"] == pytest.approx(1.0, rel=1e-9)
     assert not names["Growth of Φ"].holds
 
 

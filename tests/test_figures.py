@@ -22,7 +22,7 @@ from PIL import Image
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.results import style, symbols
-from gpebo_cli.results.figures import FIGURES, draw
+from gpebo_cli.results.figures import FIGURES, describe, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.series import blocks
@@ -387,6 +387,14 @@ def test_at_most_eight_panels_and_it_says_so() -> None:
     figure = style.compose([panel] * 30)
     assert len(figure.axes) == style.MAX_PANELS
     assert figure.texts[0].get_text() == "8 of 30 shown"
+
+
+def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
+    result = make_result(samples=11)
+    measured = result.signals.outputs + np.eye(11)[:, :1]
+    noisy = replace(result, simulation=replace(result.simulation, measured_outputs=measured))
+    _, outputs = describe(noisy, ["signals"])["signals"]
+    assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
 
 
 def test_unknown_figures_are_refused_at_once() -> None:

@@ -109,9 +109,12 @@ def test_estimators_are_overlaid(written: Path) -> None:
     assert names == {"gradient", "least_squares", "mre", "drem", "lion", "ls_drem", "fct"}
 
 
-def test_a_second_time_every_byte_is_the_same(written: Path, tmp_path: Path) -> None:
+def test_a_second_time_every_byte_is_the_same(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = ["paper_circuit", "paper_canonical"]
     assert figures.main([*names, "--output", str(tmp_path)]) == 0
+    assert capsys.readouterr().err == ""
     for name in names:
         for path in (tmp_path / name).iterdir():
             assert path.read_bytes() == (written / name / path.name).read_bytes(), path.name
