@@ -397,6 +397,16 @@ def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
 
 
+@pytest.mark.parametrize(("gammas", "bands"), [((1e10,), 1), ((1e10, 1e8), 0)])
+def test_deviations_are_drawn_about_a_single_case(gammas: tuple[float, ...], bands: int) -> None:
+    result = make_result(gammas, samples=11)
+    estimation = estimation_of(result)
+    spread = replace(estimation, states_std=np.ones_like(estimation.states))
+    panels = describe(replace(result, estimation=spread), ["estimates_a"])["estimates_a"]
+    for panel in panels:
+        assert sum(curve.label == "± 2σ" for curve in panel.curves) == bands
+
+
 def test_unknown_figures_are_refused_at_once() -> None:
     with pytest.raises(ConfigError, match=r"no figure 'gramm'; known: .*did you mean gram\?"):
         draw(make_result(samples=5), ["gramm"])
@@ -433,6 +443,19 @@ def test_lines_differ_without_their_colours() -> None:
     assert len({line.dashes for line in style.LINES}) == len(style.LINES)
     lines = [style.line(number) for number in range(49)]
     assert len({(line.color, line.dashes) for line in lines}) == 49
+
+
+@pytest.mark.parametrize(
+    ("high", "powers"), [(9e3, []), (1.2e4, [4]), (0.012, []), (1.2e-3, [-3])]
+)
+def test_a_power_of_ten_stands_beside_numbers_that_are_large_or_small(
+    high: float, powers: list[int]
+) -> None:
+    t = np.array([0.0, 1.0])
+    panel = style.Panel("y", (style.Curve(t, high * t, "", style.line(0)),))
+    [axes] = style.compose([panel]).axes
+    text = "".join(text.get_text() for text in axes.findobj(Text))
+    assert [power for power in range(-9, 10) if style.power_of_ten(power) in text] == powers
 
 
 @given(st.floats(-1e6, 1e6, allow_subnormal=False), st.floats(1e-3, 1e6, allow_subnormal=False))

@@ -374,6 +374,8 @@ def test_update_writes_what_check_reads(tmp_path: Path) -> None:
     assert stems(tmp_path / "tables" / "literal_regressor", "csv") == stems(
         TABLES / "literal_regressor", "csv"
     )
+    _, rows = read_table(tmp_path / "tables" / "literal_regressor" / "fig2_regressor.csv")
+    assert (rows[0, 0], len(rows)) == (0.0, 41)
 
 
 @pytest.mark.parametrize("content", ["", "t,y\n", "t,y\n1,2,3\n", "t,y\n1,x\n", "t,y\n,1\n"])
