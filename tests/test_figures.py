@@ -267,6 +267,7 @@ EIGENVALUES = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
 
 @pytest.mark.parametrize(("name", "gammas", "title", "entries"), [
     ("parameter_error", (1e10, 1e8), "", ["γ = 10¹⁰", "γ = 10⁸"]),
+    ("state_error_a", (1e6, 1e7, 1e8, 1e9), "", [f"γ = 10{power}" for power in "⁶⁷⁸⁹"]),
     ("state_error_a", tuple(np.logspace(6, 12, 25)), "4 of 25 cases:",
      ["γ = 10⁶", "γ = 10⁸", "γ = 10¹⁰", "γ = 10¹²"]),
     ("gram", (1e10, 1e8), "", [*EIGENVALUES, r"$\rho$ = 10⁻⁷", "$t_c$ = 0.24 s"]),

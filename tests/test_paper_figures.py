@@ -114,7 +114,9 @@ def test_a_second_time_every_byte_is_the_same(
 ) -> None:
     names = ["paper_circuit", "paper_canonical"]
     assert figures.main([*names, "--output", str(tmp_path)]) == 0
-    assert capsys.readouterr().err == ""
+    said = capsys.readouterr()
+    counts = [f"{name}: {len(stems(tmp_path / name, 'png'))} figures" for name in names]
+    assert (said.out.splitlines()[:-1], said.err) == (counts, "")
     for name in names:
         for path in (tmp_path / name).iterdir():
             assert path.read_bytes() == (written / name / path.name).read_bytes(), path.name
@@ -367,10 +369,14 @@ def test_a_changed_table_fails_the_check(tmp_path: Path) -> None:
     )
 
 
-def test_update_writes_what_check_reads(tmp_path: Path) -> None:
+def test_update_writes_what_check_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     where = str(tmp_path / "tables")
-    figures.main(["literal_regressor", "--output", str(tmp_path), "--update", where])
-    figures.main(["literal_regressor", "--output", str(tmp_path), "--check", where])
+    words = ["literal_regressor", "--quiet", "--output", str(tmp_path)]
+    figures.main([*words, "--update", where])
+    figures.main([*words, "--check", where])
+    assert capsys.readouterr().out == ""
     assert stems(tmp_path / "tables" / "literal_regressor", "csv") == stems(
         TABLES / "literal_regressor", "csv"
     )
