@@ -94,6 +94,8 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert names["Growth of Φ"].evidence["largest_entry"] == pytest.approx(np.exp(20), rel=1e-9)
     assert names["Growth of Φ"].evidence["rate"] == pytest.approx(1.0, rel=1e-9)
     assert not names["Growth of Φ"].holds
+    falls = found(plant_from_mapping(one_state(A=[[-1]])))["Growth of Φ"]
+    assert falls.evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -369,7 +369,8 @@ def test_figures_are_as_wide_as_asked_for(width: float, inches: float) -> None:
 IN_MATHEMATICS = {
     "x1": "$x_{1}$", "theta": r"$\theta$", "theta1": r"$\theta_{1}$", "il": "$i_L$",
     "e0_il": "$e_{0,i_L}$", "ir2": r"$\mathrm{ir}_{2}$", "xi_a0": r"$\xi_{a_{0}}$",
-    "leak": r"$\mathrm{leak}$", "flow_of_the_inlet": "flow_of_the_inlet",
+    "leak": r"$\mathrm{leak}$", "flow_of_inlet": "flow_of_inlet",
+    "flow_of_tank": r"$\mathrm{flow}_{\mathrm{of},\mathrm{tank}}$",
 }
 NUMBERS = {1e10: "10¹⁰", -1e-7: "−10⁻⁷", 2.5e-7: "2.5·10⁻⁷", 0.5: "0.5", 0.0: "0",
            9999.0: "9999", -3.25: "−3.25"}
