@@ -68,6 +68,10 @@ def test_the_papers_circuit(order):
         assert ours.to_pandas(table).equals(shipped.to_pandas(table)), table
 
 
+def test_one_pair_of_a_time_and_a_value_is_a_constant():
+    assert plant_of("one\nV1 a 0 PWL(0 2)\nR1 a 0 1\n")["inputs"] == {"V1": "2.0"}
+
+
 NETLISTS = {  # name: (netlist, what is measured, index)
     "rc": ("rc\nV1 in 0 SIN(0 1 0.5)\nR1 in out 2\nC1 out 0 0.5 ic=0.3\n", "v(out)", 1),
     "rlc": (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
+from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
@@ -99,6 +101,16 @@ def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
         )
         found.append(noise_level(directly, regression, Rows(mesh_edges), np.ones(1)) ** 2)
     assert np.mean(found) == pytest.approx(0.09, rel=4.0 * np.sqrt(2.0 / 4.0 / 400))
+
+
+def test_the_level_of_segments_is_their_mean_square_over_time(monkeypatch):
+    """σ = 1 for one second and σ = 2 for three; of a segment of which nobody knows it, nothing."""
+    monkeypatch.setattr(of_runs, "noise_level", lambda _, own, *__: own.level)
+    ends = [(2.0, 3.0, 1.0), (3.0, 6.0, 2.0), (6.0, 9.0, np.nan)]
+    segments = [SimpleNamespace(mesh=SimpleNamespace(edges=each[:2]), level=each[2])
+                for each in ends]
+    found = of_runs._level(None, SimpleNamespace(segments=segments), None, np.ones(1), None)
+    assert found == pytest.approx(np.sqrt((1.0 + 3.0 * 4.0) / 4.0))
 
 
 @pytest.mark.parametrize(("name", "remedy", "chosen"), [
