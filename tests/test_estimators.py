@@ -665,6 +665,14 @@ def test_wrong_settings_are_refused_with_one_line(settings, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("name", "gains", "more"), [
+    ("least_squares", {"f0": 0.5}, {"bound": 2.0}),  # no covariance without forgetting is above 1/f₀
+    ("ls_drem", {"gamma": 1.0}, {"f0": 1e-4}),  # the default
+])
+def test_what_is_the_same_with_one_more_setting(name, gains, more):
+    np.testing.assert_array_equal(run(name, CLEAN, **gains), run(name, CLEAN, **gains, **more))
+
+
 def test_every_estimator_has_a_config():
     from plants import CONF
 
