@@ -666,7 +666,7 @@ def test_wrong_settings_are_refused_with_one_line(settings, message):
 
 
 @pytest.mark.parametrize(("name", "gains", "more"), [
-    ("least_squares", {"f0": 0.5}, {"bound": 2.0}),  # no covariance without forgetting is above 1/f₀
+    ("least_squares", {"f0": 0.5}, {"bound": 2.0}),  # without forgetting none is above 1/f₀
     ("ls_drem", {"gamma": 1.0}, {"f0": 1e-4}),  # the default
 ])
 def test_what_is_the_same_with_one_more_setting(name, gains, more):

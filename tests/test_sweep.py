@@ -416,10 +416,10 @@ def test_error_curves_are_those_of_the_run(tmp_path):
     # At the start the estimates are zero: the error is η itself, (1.5, −0.8, −1, 1).
     assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
     assert slow.parameter_size == slow.parameters[0]
-    x, estimates = (pd.read_csv(tmp_path / "a" / f"{name}.csv") for name in ("signals", "estimates"))
-    names = ["x1", "x2", "x3"]
-    away = estimates[estimates["case"] == 0][[f"{name}_hat" for name in names]] - x[names].values
-    np.testing.assert_allclose(slow.states, np.linalg.norm(away, axis=1))
+    x = pd.read_csv(tmp_path / "a" / "signals.csv")[["x1", "x2", "x3"]]
+    hats = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")[[f"{i}_hat" for i in x]]
+    away = np.linalg.norm(hats.to_numpy() - x.to_numpy(), axis=1)
+    np.testing.assert_allclose(slow.states, away)
     # The metric is of scaled states, the curves are not: their ratio is that of sizes of states.
     for case, curves in zip(cases, (slow, fast), strict=True):
         rms = np.sqrt(trapezoid(curves.states**2, curves.t) / 20.0)
