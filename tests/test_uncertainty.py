@@ -469,6 +469,7 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     ("descriptor", {"gamma": "logspace(0,2,33)"}, "each of 33 cases would take a pass of its own"),
     ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
      "each of 33 cases would take a pass of its own"),
+    ("descriptor", {"observer": {"sample_time": 0.1}, "time": {"horizon": 2.0}}, ""),
     ("boost", {}, "noise of the signals is in the matrices"), ("boost", {"noise": "none"}, ""),
     ("circuit", {"estimator": "gradient", "gamma": 1e20}, "the gain is so large"),
 ])
