@@ -284,8 +284,8 @@ class Observation:
     @property
     def of_constants(self) -> AffineStateMap | None:
         """The state map, where it is affine in constant parameters of one regression; else None."""
-        regression = self.regression
-        constant = self.names is None and not regression.resets and regression.dynamics is None
+        regression, constant = self.regression, self.estimator is None and self.names is None
+        constant &= not regression.resets and regression.dynamics is None
         return self.state_map if constant and isinstance(self.state_map, AffineStateMap) else None
 
 
