@@ -17,7 +17,7 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
-from gpebo_cli.estimators._information import information
+from gpebo_cli.estimators._information import information, prior_units
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
@@ -671,6 +671,12 @@ def test_wrong_settings_are_refused_with_one_line(settings, message):
 ])
 def test_what_is_the_same_with_one_more_setting(name, gains, more):
     np.testing.assert_array_equal(run(name, CLEAN, **gains), run(name, CLEAN, **gains, **more))
+
+
+def test_units_of_a_prior_are_those_of_terms_that_cancel():
+    """√(10⁻³) of √∫ of what the terms are, for 4 s; of no terms there is nothing to measure."""
+    units = prior_units(np.zeros((1, 2)), np.array([[3.0, 0.0]]), np.array([4.0]))
+    np.testing.assert_allclose(units, [[np.sqrt(1e-3) * 6.0, 1.0]])
 
 
 def test_every_estimator_has_a_config():
