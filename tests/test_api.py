@@ -198,6 +198,8 @@ def test_a_panel_on_axes_of_ones_own(circuit):
     figure, axes = plt.subplots()
     assert circuit.plot("state_error_a", ax=axes) is axes
     assert axes.get_yscale() == "log"
+    first = axes.get_lines()[0].get_ydata()
+    np.testing.assert_array_equal(first, np.abs(circuit.errors["e1"][0]))
     _, other = plt.subplots()
     circuit.plot("error of e2", ax=other)
     np.testing.assert_array_equal(

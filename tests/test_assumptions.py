@@ -14,6 +14,7 @@ from processes import printed
 from gpebo_cli import run
 from gpebo_cli.experiment.assumptions import examine, warnings
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.observers._base import largest_entry
 from gpebo_cli.settings import Settings
 
 ROOT = Path(__file__).parent.parent
@@ -92,7 +93,12 @@ def test_an_unsolvable_plant_stops_at_the_first_assumption():
 def test_growth_of_the_fundamental_matrix_is_reported():
     names = found(plant_from_mapping(one_state(A=[[1]])))
     assert names["Growth of Φ"].evidence["largest_entry"] == pytest.approx(np.exp(20), rel=1e-9)
+    assert names["Growth of Φ"].evidence["rate"] == pytest.approx(1.0, rel=1e-9)
     assert not names["Growth of Φ"].holds
+    assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
+    falls = found(plant_from_mapping(one_state(A=[[-1]])))["Growth of Φ"]
+    assert falls.evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
+    assert [largest_entry(np.array([0.25, sign * 0.5])) for sign in (1, -1)] == [0.5, 0.5]
 
 
 @pytest.mark.parametrize(

@@ -126,6 +126,18 @@ def test_any_gain_gives_the_same_limit(L_w):
     assert np.abs(error).max() < 10 * decays.evidence["transition_norm"] + 1e-9
 
 
+def test_an_entry_that_is_rounding_shows_no_state():
+    """Beside 1 it is nothing; divided by it a state would be any number."""
+    mapping = {"N21": 1, "N31": 0.5, "N32": -0.75, "c1": 1, "c2": 2}
+    A = np.diag([0.05, -0.5, 1.0, 1.0, 1.0]).tolist()
+    found = [
+        run(shipped("canonical", parameters=mapping, A=A, outputs=["y0", "y1", "y2"], C=[
+            [1, 0, 0, 0, tiny], [1, 1, 0, 0, 0], [0.5, 0, "c1", "c2", 0],
+        ])).estimation.states for tiny in (0, 1e-15)
+    ]
+    np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize("N32", [-0.75, 0])
 def test_remark_4_gain_for_constant_coefficients(N32):
     """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w, and all evidence is closed."""

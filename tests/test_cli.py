@@ -28,6 +28,7 @@ from processes import (
 )
 
 from gpebo_cli import run
+from gpebo_cli.cli.job import remove_if_empty
 
 FAST = ["figures=none", "time.samples=51"]
 
@@ -293,6 +294,15 @@ def test_closed_streams_are_no_reason_not_to_run(tmp_path, closed, words):
         capture_output=True, text=True, check=False, timeout=60,
     ))
     assert len(list(tmp_path.glob("outputs/*/**/summary.json"))) == 1
+
+
+def test_an_empty_folder_goes_unless_one_stands_in_it(tmp_path):
+    for name in ("empty", "here", "full/result"):
+        (tmp_path / name).mkdir(parents=True)
+    with inprocess.inside(tmp_path / "here"):
+        for name in ("empty", "here", "full"):
+            remove_if_empty(str(tmp_path / name))
+    assert {path.name for path in tmp_path.iterdir()} == {"here", "full"}
 
 
 @pytest.mark.parametrize("words", [["--info", "all"], ["--cfg", "all"]])

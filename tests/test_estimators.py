@@ -17,7 +17,7 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
-from gpebo_cli.estimators._information import InformationAt, information
+from gpebo_cli.estimators._information import InformationAt, information, prior_units
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
@@ -663,6 +663,20 @@ def test_wrong_settings_are_refused_with_one_line(settings, message):
     with pytest.raises(ConfigError, match=message) as caught:
         estimators.build(settings).estimate(CLEAN, T)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("name", "gains", "more"), [
+    ("least_squares", {"f0": 0.5}, {"bound": 2.0}),  # without forgetting none is above 1/f₀
+    ("ls_drem", {"gamma": 1.0}, {"f0": 1e-4}),  # the default
+])
+def test_what_is_the_same_with_one_more_setting(name, gains, more):
+    np.testing.assert_array_equal(run(name, CLEAN, **gains), run(name, CLEAN, **gains, **more))
+
+
+def test_units_of_a_prior_are_those_of_terms_that_cancel():
+    """√(10⁻³) of √∫ of what the terms are, for 4 s; of no terms there is nothing to measure."""
+    units = prior_units(np.zeros((1, 2)), np.array([[3.0, 0.0]]), np.array([4.0]))
+    np.testing.assert_allclose(units, [[np.sqrt(1e-3) * 6.0, 1.0]])
 
 
 def test_every_estimator_has_a_config():

@@ -12,6 +12,7 @@ from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec
 from scipy.optimize import brentq
 
+from gpebo_cli import run
 from gpebo_cli.evidence.excitation import assess, persistent, sampled_window_level
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
 from gpebo_cli.regression.samples import SampledRegression
@@ -47,6 +48,7 @@ def test_eigenvalues_and_window_against_quadrature():
         np.testing.assert_allclose(
             found.gram_eigenvalues[k], np.linalg.eigvalsh(gram(three, 0, T[k])), atol=1e-11
         )
+    assert found.lambda_min == pytest.approx(found.gram_eigenvalues[200, 0], rel=1e-12)
     assert np.isnan(found.pe_level[T < 2.5]).all()
     for k in (50, 111, 200):
         expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
@@ -136,6 +138,15 @@ def test_settling_time_counts_the_last_excursion():
     t = np.array([0.0, 1.0, 2.0, 3.0, 4.0])
     error = np.array([[1.0, 1e-3, 0.5, 1e-3, 1e-3]])
     assert 2.0 < settling_times(t, error[..., None], SETTLED * error[:, :1])[0, 0] < 3.0
+
+
+def test_an_error_that_falls_within_the_first_step_has_settled_there():
+    """e^(−1000t), of which 1 % is left at ln(100)/1000, before the second node."""
+    plant = {"name": "still", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]],
+             "C": [[1]], "initial_state": [1]}
+    time = {"horizon": 10, "samples": 11}
+    case = run(plant, estimator="gradient", gamma=1e3, time=time).cases[0]
+    assert case["seconds_to_1pct_e0_x"] == pytest.approx(np.log(100.0) / 1e3, rel=1e-6)
 
 
 def test_norms_that_start_at_rounding_have_settled_at_once():

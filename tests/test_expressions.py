@@ -21,6 +21,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.model.expressions import Expression, breakpoints, parse, record, shorten, taylor
 from gpebo_cli.model.expressions import tape as tape_module
+from gpebo_cli.model.expressions.intervals import Interval
 
 WHERE = "plant mine: A[0][1]"
 # Seconds of this process's own work, whatever else the machine does: what this is there to find
@@ -505,6 +506,17 @@ def test_the_innermost_name_is_blamed() -> None:
 def test_a_value_that_is_not_finite_inside_an_interval() -> None:
     with pytest.raises(ConfigError, match="no finite value at t = 2"):
         taylor([read("sign(1/(t - 2))")], np.array([1.0]), 0, inside=np.array([2.0]))
+
+
+@pytest.mark.parametrize(("function", "low", "high", "least", "most"), [
+    (np.sin, 0.0, np.pi, 0.0, 1.0), (np.sin, 3.0, 6.0, -1.0, np.sin(3.0)),
+    (np.sin, -np.inf, 0.0, -1.0, 1.0), (np.sin, 2.0, 3.0, np.sin(3.0), np.sin(2.0)),
+    (np.cos, -1.0, 2.0, np.cos(2.0), 1.0), (np.tan, 1.0, 2.0, -np.inf, np.inf),
+    (np.tan, -1.0, 1.0, np.tan(-1.0), np.tan(1.0)),
+])
+def test_bounds_of_waves_hold_their_crests_and_poles(function, low, high, least, most):
+    found = function(Interval(np.array([low]), np.array([high])))
+    np.testing.assert_allclose([found.low[0], found.high[0]], [least, most], atol=1e-14)
 
 
 # Jumps and kinks

@@ -22,7 +22,7 @@ from PIL import Image
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.results import style, symbols
-from gpebo_cli.results.figures import FIGURES, draw
+from gpebo_cli.results.figures import FIGURES, describe, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.series import blocks
@@ -267,6 +267,7 @@ EIGENVALUES = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
 
 @pytest.mark.parametrize(("name", "gammas", "title", "entries"), [
     ("parameter_error", (1e10, 1e8), "", ["γ = 10¹⁰", "γ = 10⁸"]),
+    ("state_error_a", (1e6, 1e7, 1e8, 1e9), "", [f"γ = 10{power}" for power in "⁶⁷⁸⁹"]),
     ("state_error_a", tuple(np.logspace(6, 12, 25)), "4 of 25 cases:",
      ["γ = 10⁶", "γ = 10⁸", "γ = 10¹⁰", "γ = 10¹²"]),
     ("gram", (1e10, 1e8), "", [*EIGENVALUES, r"$\rho$ = 10⁻⁷", "$t_c$ = 0.24 s"]),
@@ -368,7 +369,8 @@ def test_figures_are_as_wide_as_asked_for(width: float, inches: float) -> None:
 IN_MATHEMATICS = {
     "x1": "$x_{1}$", "theta": r"$\theta$", "theta1": r"$\theta_{1}$", "il": "$i_L$",
     "e0_il": "$e_{0,i_L}$", "ir2": r"$\mathrm{ir}_{2}$", "xi_a0": r"$\xi_{a_{0}}$",
-    "leak": r"$\mathrm{leak}$", "flow_of_the_inlet": "flow_of_the_inlet",
+    "leak": r"$\mathrm{leak}$", "flow_of_inlet": "flow_of_inlet",
+    "flow_of_tank": r"$\mathrm{flow}_{\mathrm{of},\mathrm{tank}}$",
 }
 NUMBERS = {1e10: "10¹⁰", -1e-7: "−10⁻⁷", 2.5e-7: "2.5·10⁻⁷", 0.5: "0.5", 0.0: "0",
            9999.0: "9999", -3.25: "−3.25"}
@@ -387,6 +389,24 @@ def test_at_most_eight_panels_and_it_says_so() -> None:
     figure = style.compose([panel] * 30)
     assert len(figure.axes) == style.MAX_PANELS
     assert figure.texts[0].get_text() == "8 of 30 shown"
+
+
+def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
+    result = make_result(samples=11)
+    measured = result.signals.outputs + np.eye(11)[:, :1]
+    noisy = replace(result, simulation=replace(result.simulation, measured_outputs=measured))
+    _, outputs = describe(noisy, ["signals"])["signals"]
+    assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
+
+
+@pytest.mark.parametrize(("gammas", "bands"), [((1e10,), 1), ((1e10, 1e8), 0)])
+def test_deviations_are_drawn_about_a_single_case(gammas: tuple[float, ...], bands: int) -> None:
+    result = make_result(gammas, samples=11)
+    estimation = estimation_of(result)
+    spread = replace(estimation, states_std=np.ones_like(estimation.states))
+    panels = describe(replace(result, estimation=spread), ["estimates_a"])["estimates_a"]
+    for panel in panels:
+        assert sum(curve.label == "± 2σ" for curve in panel.curves) == bands
 
 
 def test_unknown_figures_are_refused_at_once() -> None:
@@ -425,6 +445,19 @@ def test_lines_differ_without_their_colours() -> None:
     assert len({line.dashes for line in style.LINES}) == len(style.LINES)
     lines = [style.line(number) for number in range(49)]
     assert len({(line.color, line.dashes) for line in lines}) == 49
+
+
+@pytest.mark.parametrize(
+    ("high", "powers"), [(9e3, []), (1.2e4, [4]), (0.012, []), (1.2e-3, [-3])]
+)
+def test_a_power_of_ten_stands_beside_numbers_that_are_large_or_small(
+    high: float, powers: list[int]
+) -> None:
+    t = np.array([0.0, 1.0])
+    panel = style.Panel("y", (style.Curve(t, high * t, "", style.line(0)),))
+    [axes] = style.compose([panel]).axes
+    text = "".join(text.get_text() for text in axes.findobj(Text))
+    assert [power for power in range(-9, 10) if style.power_of_ten(power) in text] == powers
 
 
 @given(st.floats(-1e6, 1e6, allow_subnormal=False), st.floats(1e-3, 1e6, allow_subnormal=False))

@@ -68,6 +68,10 @@ def test_the_papers_circuit(order):
         assert ours.to_pandas(table).equals(shipped.to_pandas(table)), table
 
 
+def test_one_pair_of_a_time_and_a_value_is_a_constant():
+    assert plant_of("one\nV1 a 0 PWL(0 2)\nR1 a 0 1\n")["inputs"] == {"V1": "2.0"}
+
+
 NETLISTS = {  # name: (netlist, what is measured, index)
     "rc": ("rc\nV1 in 0 SIN(0 1 0.5)\nR1 in out 2\nC1 out 0 0.5 ic=0.3\n", "v(out)", 1),
     "rlc": (
@@ -425,7 +429,7 @@ B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])
 
 def test_a_state_space_model():
     system = SimpleNamespace(
-        A=A, B=B, C=C, D=np.zeros((1, 1)), dt=0, state_labels=["x[0]", "x[1]"],
+        A=A, B=B, C=C, D=np.zeros((1, 1)), dt=0, state_labels=["x[0]", "1"],
         input_labels=["u"], output_labels=["y"],
     )
     plant = from_control(system, "oscillator", initial_state=[1, 0]).mapping()
@@ -434,6 +438,13 @@ def test_a_state_space_model():
     system.dt = 0.1
     with pytest.raises(ConfigError, match="discrete time"):
         from_control(system, "oscillator")
+
+
+@pytest.mark.parametrize(("n", "names"), [(50, {".yaml"}), (51, {".yaml", ".npz"})])
+def test_more_than_fifty_states_are_in_an_archive(n, names):
+    system = SimpleNamespace(A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n), D=[[0]], dt=0)
+    files = from_control(system, "many", initial_state=[1] * n).files()
+    assert {Path(name).suffix for name in files} == names
 
 
 LEAK = (

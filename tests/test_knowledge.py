@@ -19,7 +19,7 @@ from random_systems import largest_error, random_system, run_system
 from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
-from gpebo_cli.experiment.sensors import candidates
+from gpebo_cli.experiment.sensors import _fall, _Found, candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results import style
 from gpebo_cli.results.figures import describe
@@ -199,7 +199,9 @@ def test_what_is_not_determined_is_dashed_in_the_figures():
 def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
     words = ("check", "--config-dir", ".", "plant=half_seen", "sensors=all")
     done = gpebo(*words, cwd=half_seen)
-    assert done.returncode == 1
+    assert (done.returncode, done.stderr) == (1, "")
+    all_known = ["c", str(len(SEEN | UNSEEN))]
+    assert all_known in [line.split()[:2] for line in done.stdout.splitlines()]
     assert "k2    cannot be known" in done.stdout
     assert "k1    estimable from" in done.stdout
     content = json.loads(gpebo(*words, "--json", cwd=half_seen).stdout)
@@ -209,6 +211,13 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
     assert set(first["gained"]) == UNSEEN
     assert all(not sensor["gained"] for sensor in content["sensors"][1:])
     assert all(sensor["fall"] >= 1.0 for sensor in content["sensors"])
+
+
+def test_deviations_fall_by_the_mean_of_what_both_know():
+    """4 and, as no row takes information away, 1: √(4·1); of nothing that both know, 1."""
+    before = _Found({"a": 4.0, "b": 1.0, "c": 0.0}, 0.0)
+    assert _fall(before, _Found({"a": 1.0, "b": 2.0, "c": 1.0}, 0.0)) == pytest.approx(2.0)
+    assert _fall(before, _Found({"c": 1.0}, 0.0)) == 1.0
 
 
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])

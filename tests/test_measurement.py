@@ -66,12 +66,12 @@ def test_no_noise_is_the_run_without_noise_bit_for_bit():
 
 def test_a_signal_without_noise_of_its_own_keeps_its_bits():
     system = shipped("descriptor")
-    settings = Settings(
-        estimator={"name": "least_squares"}, time=TIME,
-        noise=NoiseSettings(outputs=0.1, sample_time=0.05),
-    )
+    noise = NoiseSettings(outputs=0.1, sample_time=0.05)
+    settings = Settings(estimator={"name": "least_squares"}, time=TIME, noise=noise)
     simulation = run_experiment(settings, system).simulation
     assert simulation.measured_inputs.tobytes() == simulation.inputs.tobytes()
+    noisy = run_experiment(replace(settings, noise=replace(noise, inputs=0.1)), system).simulation
+    assert np.std(noisy.measured_inputs - noisy.inputs) == pytest.approx(0.1, rel=0.3)
     assert np.std(simulation.measured_outputs - simulation.outputs) == pytest.approx(0.1, rel=0.3)
 
 

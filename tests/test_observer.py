@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from plants import observed, reference, seen, shipped
 
+from gpebo_cli import estimators
 from gpebo_cli import run as experiment
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
@@ -70,6 +73,13 @@ def test_regression_holds_with_the_true_parameters(name):
     expected = reference(name)
     e0 = truth[len(shipped(name).unknowns):]
     np.testing.assert_allclose(e0, expected["e0"], atol=1e-12)
+
+
+def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
+    _, observation, _ = run(shipped("descriptor"))
+    assert observation.of_constants is observation.state_map
+    assert replace(observation, estimator=estimators.build({"name": "drem"})).of_constants is None
+    assert replace(observation, names=("a",)).of_constants is None
 
 
 def test_circuit_regressor_matches_the_reference_up_to_sign():

@@ -109,9 +109,14 @@ def test_estimators_are_overlaid(written: Path) -> None:
     assert names == {"gradient", "least_squares", "mre", "drem", "lion", "ls_drem", "fct"}
 
 
-def test_a_second_time_every_byte_is_the_same(written: Path, tmp_path: Path) -> None:
+def test_a_second_time_every_byte_is_the_same(
+    written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     names = ["paper_circuit", "paper_canonical"]
     assert figures.main([*names, "--output", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    counts = [f"{name}: {len(stems(tmp_path / name, 'png'))} figures" for name in names]
+    assert (said.out.splitlines()[:-1], said.err) == (counts, "")
     for name in names:
         for path in (tmp_path / name).iterdir():
             assert path.read_bytes() == (written / name / path.name).read_bytes(), path.name
@@ -364,13 +369,19 @@ def test_a_changed_table_fails_the_check(tmp_path: Path) -> None:
     )
 
 
-def test_update_writes_what_check_reads(tmp_path: Path) -> None:
+def test_update_writes_what_check_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     where = str(tmp_path / "tables")
-    figures.main(["literal_regressor", "--output", str(tmp_path), "--update", where])
-    figures.main(["literal_regressor", "--output", str(tmp_path), "--check", where])
+    words = ["literal_regressor", "--quiet", "--output", str(tmp_path)]
+    figures.main([*words, "--update", where])
+    figures.main([*words, "--check", where])
+    assert capsys.readouterr().out == ""
     assert stems(tmp_path / "tables" / "literal_regressor", "csv") == stems(
         TABLES / "literal_regressor", "csv"
     )
+    _, rows = read_table(tmp_path / "tables" / "literal_regressor" / "fig2_regressor.csv")
+    assert (rows[0, 0], len(rows)) == (0.0, 41)
 
 
 @pytest.mark.parametrize("content", ["", "t,y\n", "t,y\n1,2,3\n", "t,y\n1,x\n", "t,y\n,1\n"])

@@ -218,8 +218,10 @@ def test_so_it_may_in_a_stream():
         data=DataSettings(hold={"u": "zoh"}), time=TimeSettings(np.nan, np.nan),
     )
     online = stream(settings, plant_from_mapping(STEPPED))(rows["t"][0], np.append(u[0], y[0]))
-    found = online.feed(rows["t"], u, y).parameters[0, -1, :2]
-    np.testing.assert_allclose(found, [2.5, 0.4], atol=1e-11)
+    made = online.feed(rows["t"], u, y)
+    np.testing.assert_allclose(made.parameters[0, -1, :2], [2.5, 0.4], atol=1e-11)
+    *of_psi, of_Y = np.linalg.norm(made.regression.weighted(), axis=(0, 1))
+    np.testing.assert_allclose(online.natural_sizes * of_psi, of_Y, rtol=1e-9)
 
 
 def test_elements_end_where_one_of_the_signals_bends():

@@ -30,6 +30,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression import dynamics
 from gpebo_cli.regression.dynamics import Dynamics, filtered
@@ -559,6 +560,11 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
 def test_command_refuses_in_one_line(words, message, tmp_path):
     done = gpebo("run", "plant=circuit", "figures=none", *words, cwd=tmp_path)
     assert_refused(done, message)
+
+
+def test_resets_are_at_edges_between_the_start_and_the_end():
+    mesh, times = _with_edges(initial_mesh(0.0, 2.0, [], 2, radau_rule(3)), np.array([0, 0.5, 2]))
+    assert (mesh.edges.tolist(), times.tolist()) == ([0.0, 0.5, 1.0, 2.0], [0.5])
 
 
 def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):

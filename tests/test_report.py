@@ -15,8 +15,10 @@ import pytest
 from examples import gpebo
 from processes import assert_refused, refused
 
+from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.results.report import estimate_table
 
 FAST = ("time.samples=51", "time.horizon=8")
 
@@ -43,6 +45,15 @@ def done(*words, cwd):
     made = gpebo(*words, cwd=cwd)
     assert made.returncode == 0, made.stderr
     return made
+
+
+def test_an_estimate_stands_since_it_is_within_a_hundredth_of_its_end():
+    """1 − e^(−2t) at whole seconds: e⁻⁴ is more, e⁻⁶ is less."""
+    plant = {"name": "still", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]],
+             "C": [[1]], "initial_state": [1]}
+    found = run(plant, estimator="gradient", gamma=2, time={"horizon": 10, "samples": 11})
+    (row,) = [line for line in estimate_table(found.details) if "e0_x" in line]
+    assert "  3 s  " in row
 
 
 @pytest.fixture(scope="module")

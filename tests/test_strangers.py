@@ -21,7 +21,7 @@ from processes import assert_refused, refused
 
 from gpebo_cli import run
 from gpebo_cli.configs.configuration import KEYS
-from gpebo_cli.configs.text import parse
+from gpebo_cli.configs.text import dump, parse
 from gpebo_cli.errors import ConfigError
 
 REGRESSION = "name: mine\nunknowns: {a: 1}\nsignals: {u: sin(t), y: sin(t)}\nY: [y]\npsi: [[u]]\n"
@@ -157,6 +157,11 @@ def test_nor_from_python(tmp_path, payload, group):
         with refused():
             run(**{"plant": "circuit", group: name}, time=time, config_dir=folder)
         assert not marker.exists()
+
+
+def test_what_stands_in_two_places_is_written_twice():
+    rows = [[1, 2]]
+    assert dump({"A": rows, "B": rows}) == "A:\n- [1, 2]\nB:\n- [1, 2]\n"
 
 
 def test_a_recipe_may_sweep_and_nothing_else(tmp_path):

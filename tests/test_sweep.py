@@ -7,6 +7,7 @@ import json
 import os
 import re
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -384,7 +385,7 @@ def test_runs_and_their_cases_are_compared_with_a_heat_map_of_two_gains(tmp_path
 
 
 def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
-    from gpebo_cli.results.comparison import metric_panels
+    from gpebo_cli.results.comparison import _is_axis, metric_panels
     from gpebo_cli.results.finished import METRICS, Case
 
     def case(run, gain, error):
@@ -394,20 +395,31 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in range(3)]
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
     assert [curve.y.tolist() for curve in first.curves] == [[1e-9] * 3]
+    two = [replace(c, settings={"estimator": name}) for name in ("drem", "mre") for c in quiet]
+    legends = [panel.legend for panel in metric_panels(two, "gamma")]
+    assert legends == [True, *[False] * (len(METRICS) - 1)]
+    assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 
 def test_error_curves_are_those_of_the_run(tmp_path):
     import numpy as np
+    import pandas as pd
 
+    from gpebo_cli.results.comparison import error_panels
     from gpebo_cli.results.finished import read_errors, read_run
 
     words = ["run", "estimator.gamma=[1e6,1e8]", "plant=descriptor", "estimator=ls_drem", *FAST]
     assert gpebo(*words, "hydra.run.dir=a", cwd=tmp_path).returncode == 0
     cases = read_run("a", tmp_path / "a", {})
+    assert [panel.note for panel in error_panels(cases)] == ["", ""], "none is left out"
     slow, fast = read_errors(cases)
     # At the start the estimates are zero: the error is η itself, (1.5, −0.8, −1, 1).
     assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
     assert slow.parameter_size == slow.parameters[0]
+    x = pd.read_csv(tmp_path / "a" / "signals.csv")[["x1", "x2", "x3"]]
+    hats = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")[[f"{i}_hat" for i in x]]
+    away = np.linalg.norm(hats.to_numpy() - x.to_numpy(), axis=1)
+    np.testing.assert_allclose(slow.states, away)
     # The metric is of scaled states, the curves are not: their ratio is that of sizes of states.
     for case, curves in zip(cases, (slow, fast), strict=True):
         rms = np.sqrt(trapezoid(curves.states**2, curves.t) / 20.0)

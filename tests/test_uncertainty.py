@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
+from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
@@ -88,18 +90,24 @@ def test_an_estimate_that_follows_samples_at_once_does_so_between_them(rate):
 
 
 def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
-    """White samples around a constant: the estimate of σ² has no bias, for as few as five."""
-    mesh_edges = np.linspace(0.0, 5.0, 6)
-    generator, found = np.random.default_rng(3), []
-    for _ in range(400):
-        sample = generator.normal(2.0, 0.3, 5)
-        regression = LinearRegression.from_functions(
-            lambda t: np.ones((*t.shape, 1, 1)),
-            lambda t, sample=sample: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1),
-            ["a"], 5.0, 5,
-        )
-        found.append(noise_level(directly, regression, Rows(mesh_edges), np.ones(1)) ** 2)
-    assert np.mean(found) == pytest.approx(0.09, rel=4.0 * np.sqrt(2.0 / 4.0 / 400))
+    """White samples around a constant: σ² is Σ(y − mean)²/(N − 1), which has no bias."""
+    sample = np.random.default_rng(3).normal(2.0, 0.3, 5)
+    regression = LinearRegression.from_functions(
+        lambda t: np.ones((*t.shape, 1, 1)),
+        lambda t: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1), ["a"], 5.0, 5,
+    )
+    level = noise_level(directly, regression, Rows(np.linspace(0.0, 5.0, 6)), np.ones(1))
+    assert level == pytest.approx(np.std(sample, ddof=1), rel=1e-9)
+
+
+def test_the_level_of_segments_is_their_mean_square_over_time(monkeypatch):
+    """σ = 1 for one second and σ = 2 for three; of a segment of which nobody knows it, nothing."""
+    monkeypatch.setattr(of_runs, "noise_level", lambda _, own, *__: own.level)
+    ends = [(2.0, 3.0, 1.0), (3.0, 6.0, 2.0), (6.0, 9.0, np.nan)]
+    segments = [SimpleNamespace(mesh=SimpleNamespace(edges=each[:2]), level=each[2])
+                for each in ends]
+    found = of_runs._level(None, SimpleNamespace(segments=segments), None, np.ones(1), None)
+    assert found == pytest.approx(np.sqrt((1.0 + 3.0 * 4.0) / 4.0))
 
 
 @pytest.mark.parametrize(("name", "remedy", "chosen"), [
@@ -462,6 +470,7 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     ("descriptor", {"gamma": "logspace(0,2,33)"}, "each of 33 cases would take a pass of its own"),
     ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
      "each of 33 cases would take a pass of its own"),
+    ("descriptor", {"observer": {"sample_time": 0.1}, "time": {"horizon": 2.0}}, ""),
     ("boost", {}, "noise of the signals is in the matrices"), ("boost", {"noise": "none"}, ""),
     ("circuit", {"estimator": "gradient", "gamma": 1e20}, "the gain is so large"),
 ])

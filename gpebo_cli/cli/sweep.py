@@ -166,7 +166,7 @@ def _launch(
     from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 
     one_by_one = isinstance(launcher, BasicLauncher)  # fail_fast can stop between any two
-    size = 1 if one_by_one else orders.max_batch_size or max(len(waiting), 1)
+    size = 1 if one_by_one else orders.max_batch_size or len(jobs)
     where = f"hydra.sweep.dir={quoted(str(folder))}"
     # What Ray is told by variables: workers' output is in Ray's own logs, no usage report.
     os.environ.setdefault("RAY_LOG_TO_DRIVER", "0")

@@ -217,7 +217,7 @@ def run_filter(
     size = np.maximum(np.einsum("kjii->kj", P), np.finfo(float).tiny)
     relative = np.linalg.eigvalsh(P)[..., 0] / size
     if relative.min() < -_INDEFINITE:
-        t = solution.trajectory.mesh.points[int(np.argmin(relative.min(axis=1))), 0]
+        t = solution.trajectory.mesh.points.flat[np.argmax(relative < -_INDEFINITE)]
         raise SolverError(
             f"the covariance of the {name} is not positive semidefinite near t = {t:.6g} "
             f"(eigenvalue {relative.min():.1e} of its trace); lower observer.P0, or raise "
