@@ -168,6 +168,16 @@ def test_no_piece_between_jumps_goes_unprobed():
     assert np.unique(probed).tolist() == list(range(1, len(pieces) + 1))
 
 
+def test_a_rank_that_changes_is_named_with_both_its_values():
+    """E22 is zero at the first probe alone, where of six equations five are left."""
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b"], "E": [[1, 0], [0, "1000*t - 1"]],
+        "A": [[-1, 1], [1, -1]], "initial_state": [1, 1],
+    })
+    with pytest.raises(ModelError, match=r"changes from 5 at t = 0\.001 to 6 at t = 0\.03"):
+        analyse(plant, 0.0, 1.0, max_mu=2, rank_tol=1e-10)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     """a' = l, b' = 3l − b, 0 = a + b: 3a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""
