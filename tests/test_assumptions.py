@@ -166,6 +166,6 @@ def test_what_is_zero_but_for_rounding_does_not_jump():
         inputs={"u": "step(t - 1)"}, B=[[1], [2], [3], [0]], C=[[1, 0, 0, 0]],
         initial_state=[100, 200, 300, 0],
     )
-    simulated = run_experiment(Settings(observer={"name": "none"}), system).simulation
+    simulated = run_experiment(Settings({}, observer={"name": "none"}), system).simulation
     assert simulated.jumps == ()
     assert 0.0 < np.abs(simulated.states[:, 3]).max() < 1e-9
