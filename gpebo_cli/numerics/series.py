@@ -268,7 +268,8 @@ def _degrees(values: Array, size: Array, rule: RadauRule, tol: float) -> Array:
     """
     if len(values) == 1:
         return values[None]
-    found = rule.to_legendre @ values.reshape(-1, len(rule.points), values.shape[1])
+    points = len(rule.points)
+    found = rule.to_legendre @ values.reshape(len(values) // points, points, -1)
     counts = (largest_over_time(found) > tol * size).any(axis=1)
     return found[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
 
