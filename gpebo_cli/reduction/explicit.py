@@ -206,8 +206,10 @@ class _Equations:
         factor = self.divided[self.place[0][plain]]
         waiting, factor = place[: plain.sum()][factor >= 0], factor[factor >= 0]
         entries = np.empty((count, len(i)))
-        of_all, E = np.broadcast_to(self.values[0], (count, self.values.shape[2])), self.found.values.E[0]
-        of_all.take(of_plain, axis=1, out=entries, mode="clip")  # another mode would copy
+        E, of_all = self.found.values.E[0], (count, self.values.shape[2])
+        np.broadcast_to(self.values[0], of_all).take(
+            of_plain, axis=1, out=entries, mode="clip"  # another mode would copy
+        )
         for first in range(0, count, _AT_ONCE) if len(waiting) else ():
             some = slice(first, first + _AT_ONCE)
             entries[some, waiting] /= (E[some] if len(E) > 1 else E)[:, factor]

@@ -65,7 +65,7 @@ def strangeness_free_form(
     """The strangeness-free equations at the times t (N,), one sweep over all of them.
 
     ``c`` are the model's coefficients there to the order μ, where they are at hand; at the last of
-    so many ``points`` each, terms are looked at; at about so many times as ``looks``, amplification.
+    so many ``points`` each, terms are looked at, and amplification at so many times (``looks``).
 
     Elimination on the pivots of one reference time where that is well conditioned, singular
     vectors at the times where it is not.
