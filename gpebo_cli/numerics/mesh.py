@@ -156,22 +156,23 @@ class Mesh:
 
         At an edge the element that contains ``inside`` is used; by default the one to the right.
         """
-        asked, known = (t, inside), self._sampler
-        if known and known[0][0] is t and known[0][1] is inside:
+        known, plain = self._sampler, inside is None
+        if plain and known and np.array_equal(known[0], t):
             return known[1]
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
-        rule, t = self.rule, np.asarray(t, dtype=np.float64) - self.origin
+        asked, rule, t = t, self.rule, np.asarray(t, dtype=np.float64) - self.origin
         belongs = t + _SNAP * np.abs(t) if inside is None else inside - self.origin
         found = Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))
-        known[:] = [asked, found] if found.weights.size <= _MANY else []
+        if plain and found.weights.size <= _MANY:
+            known[:] = np.array(asked), found
         return found
 
     @cached_property
     def _sampler(self) -> list[Any]:
-        """The times that were asked for last, and what came of them: several signals ask alike."""
+        """The last times that were few, and what came of them: several signals ask for the same."""
         return []
 
 
