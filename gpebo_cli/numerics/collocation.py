@@ -50,7 +50,7 @@ from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_sc
 from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
 
-_CHUNK = 1 << 20  # numbers in one batch of element systems (4 MB)
+_CHUNK = 1 << 20  # numbers in one batch of element systems (8 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
