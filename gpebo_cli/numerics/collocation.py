@@ -57,8 +57,9 @@ _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not 
 _BEYOND = 5.0  # times what the constraints are seen to be missed by, which counts of a bound
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
-# moment later, unless it has seen a larger array come and go. This one is never written to.
-np.empty(1 << 21)
+# moment later, unless it has seen a larger array come and go: up to 32 MB. This one is never
+# written to.
+np.empty((1 << 22) - 4096)
 
 
 @dataclass(frozen=True, eq=False)
