@@ -158,7 +158,7 @@ class Mesh:
         """
         known, plain = self._sampler, inside is None
         if plain and known and np.array_equal(known[0], t):
-            return known[1]
+            return known[1]  # type: ignore[no-any-return]
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         asked, rule, t = t, self.rule, np.asarray(t, dtype=np.float64) - self.origin

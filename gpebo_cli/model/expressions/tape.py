@@ -315,7 +315,7 @@ class Assembly:
             targets, fixed, there = self.targets.copy(), list(self.fixed), self.targets[:, 0] >= 0
             for name, own in some.items():
                 k = names.index(name)
-                here, fixed[k] = targets[:, 0] == k, fixed[k].flat[own]
+                here, fixed[k] = targets[:, 0] == k, fixed[k].ravel()[own]
                 there[here] = own[targets[here, 1]]
                 targets[here, 1] = (own.cumsum() - 1)[targets[here, 1]]
             tape = self.tape.of([self.tape.outputs[j] for j in there.nonzero()[0].tolist()])
