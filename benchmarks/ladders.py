@@ -77,33 +77,38 @@ HELD = {"capacitor loop": (0, 0), "inductor cutset": (1, 1), "index 3": (0, 1)}
 KINDS = ("index 1", *HELD, "stiff")
 
 
-def plant(given: Ladder, start: Array, *, varying: bool) -> DescriptorSystem:
-    """As a file would have it, by the entries that are not zero."""
+def plant(
+    given: Ladder, start: Array, *, varying: bool, unlike: bool = False
+) -> DescriptorSystem:
+    """As a file would have it, by the entries that are not zero; ``unlike``: no two are equal."""
     n = len(given.E)
     states = [f"x{k}" for k in range(n)]
 
     def entries(matrix: Array, rows: list[str], columns: list[str], by: str = "") -> dict[str, Any]:
         return {
-            f"{rows[i]},{columns[j]}": f"{matrix[i, j]}{by}" if by else float(matrix[i, j])
-            for i, j in zip(*np.nonzero(matrix), strict=True)
+            f"{rows[i]},{columns[j]}": f"{matrix[i, j]}{by.format(k + 1)}" if by else
+            float(matrix[i, j]) for k, (i, j) in enumerate(np.argwhere(matrix))
         }
 
+    own = "*(1 + 0.1*sin(t + {0}))" if unlike else ""
     # The factor of an equation 0 = … changes nothing, but stands there as in the others.
     return load_plant({
         "name": "ladder", "states": states, "inputs": {"u": "sin(t)"}, "outputs": ["y1", "y2"],
-        "E": entries(given.E, states, states), "C": entries(given.C, ["y1", "y2"], states),
-        "A": entries(given.A, states, states, "*(1 + 0.1*sin(t))" if varying else ""),
+        "E": entries(given.E, states, states, own), "C": entries(given.C, ["y1", "y2"], states),
+        "A": entries(given.A, states, states, own or "*(1 + 0.1*sin(t))" if varying else ""),
         "B": {f"{states[i]},u": f"{v}*(1 + 0.1*sin(t))" if varying and not given.E[i].any() else v
               for i, v in enumerate(given.B[:, 0].tolist()) if v},
         "initial_state": start.tolist(),
     })
 
 
-def simulation(n: int, kind: str, *, varying: bool) -> Callable[[], Any]:
+def simulation(
+    n: int, kind: str, *, varying: bool, unlike: bool = False
+) -> Callable[[], Any]:
     """One simulation, with two capacitors loaded."""
     start = np.zeros(n)
     start[1:3] = 1.0
-    system = plant(ladder(n, kind), start, varying=varying)
+    system = plant(ladder(n, kind), start, varying=varying, unlike=unlike)
     settings = TimeSettings(horizon=HORIZON, samples=101), SolverSettings(tol=TOL)
     return lambda: simulate(as_new(system), *settings)
 

@@ -75,10 +75,10 @@ def shown(value: object) -> str:
 
 def plain(value: object) -> Any:
     """``value`` with arrays, tuples, ranges and paths as the lists and texts of a YAML file."""
-    if type(value) in _WORDS:  # most are, and the rest of this takes longer
+    if isinstance(value, Mapping):  # most are words, and the rest of this takes longer
+        return {k: one if type(one) in _WORDS else plain(one) for k, one in value.items()}
+    if type(value) in _WORDS:
         return value
-    if isinstance(value, Mapping):
-        return {key: plain(inner) for key, inner in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str | bytes):
         return [plain(inner) for inner in value]
     if hasattr(value, "toarray"):  # SciPy's sparse matrices

@@ -381,11 +381,12 @@ def test_little_more_than_the_result_is_held(varying, states, experiment):
 
 @needs_kernels
 @pytest.mark.parametrize(
-    ("n", "kind", "varying"),
-    [(7, "index 1", False), *((n, kind, True) for n in (11, 41) for kind in ladders.KINDS)],
+    ("n", "kind", "varying", "unlike"),
+    [(7, "index 1", False, False), (25, "capacitor loop", True, True), (25, "index 3", True, True),
+     *((n, kind, True, False) for n in (11, 41) for kind in ladders.KINDS)],
 )
-def test_ladders_hold_less_than_ten_times_their_result(n, kind, varying):
-    work = ladders.simulation(n, kind, varying=varying)
+def test_ladders_hold_less_than_ten_times_their_result(n, kind, varying, unlike):
+    work = ladders.simulation(n, kind, varying=varying, unlike=unlike)
     size = work().signals.states.values.nbytes  # what is kept for good is there then
     assert ladders._peak(work) < 10 * size
 

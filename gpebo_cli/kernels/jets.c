@@ -237,7 +237,7 @@ static Outcome jets(Call *call)
         !targets_fit(call, varies))
         return ERROR;
     npy_intp block = IN_CACHE / used;
-    block = block < 32 ? 32 : block > 512 ? 512 : block;
+    block = block < 16 ? 16 : block > 512 ? 512 : block;
     block = block > SIZE(N) ? SIZE(N) : block;
     Rows rows = {{NULL, NULL}, NULL,       SIZE(N), known, scratch(call, (used - known) * block),
                  block,        call->in[4]};

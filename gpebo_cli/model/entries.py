@@ -11,6 +11,7 @@ import numpy as np
 from gpebo_cli.model.descriptor import (
     MATRIX_NAMES,
     Array,
+    BoolArray,
     Coefficients,
     CoefficientSource,
     IntArray,
@@ -25,6 +26,15 @@ class Entries(NamedTuple):
     values: Coefficients  # (orders, N or 1, v) each; 1 for a matrix that is constant
     places: Mapping[str, Places]  # of the entries, by the names of the matrices
     shared: Mapping[str, IntArray] = MappingProxyType({})  # (e,) which value, if not its own
+    # Of a matrix of which ``values`` has order 0 only: where each one is, or −1, in (orders, N, w).
+    moved: Mapping[str, tuple[IntArray, Array]] = MappingProxyType({})
+
+    def jets(self, name: str, some: IntArray) -> Array:
+        """Some of the values (w,) of a matrix (orders, N or 1, w), to the order that all have."""
+        found: Array = getattr(self.values, name)
+        if name in self.moved and (self.moved[name][0][some] >= 0).all():
+            some, found = self.moved[name][0][some], self.moved[name][1]
+        return found[:, :, some]
 
     def which(self, name: str) -> IntArray:
         """Which of the values each entry of a matrix has, (e,)."""
@@ -43,15 +53,17 @@ def is_sparse(value: object) -> TypeGuard[Any]:
 
 
 def entries(
-    source: CoefficientSource, t: Array, order: int, inside: Array | None = None
+    source: CoefficientSource, t: Array, order: int, inside: Array | None = None,
+    moved: Mapping[str, BoolArray] = MappingProxyType({}),
 ) -> Entries:
     """Those of a source at the times t (N,), see ``CoefficientSource.taylor``.
 
-    A source that has its entries apart gives them by a method of this name.
+    A source that has its entries apart gives them by a method of this name. Of matrices that are
+    in ``moved`` (v,) derivatives of other values than those are not needed.
     """
-    own: Callable[[Array, int, Array | None], Entries] | None = getattr(source, "entries", None)
+    own: Callable[..., Entries] | None = getattr(source, "entries", None)
     if own is not None:
-        return own(t, order, inside)
+        return own(t, order, inside, moved)
     return entries_of(source.taylor(t, order, inside), source.constant)
 
 

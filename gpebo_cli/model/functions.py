@@ -54,7 +54,9 @@ class FunctionCoefficients:
     places: Mapping[str, Places] = field(default_factory=dict)
     whole: Mapping[str, tuple[int, ...]] = field(default_factory=dict)  # shapes of those matrices
 
-    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:  # noqa: ARG002
+    def entries(
+        self, t: Array, order: int, inside: Array | None = None, _moved: object = None  # noqa: ARG002
+    ) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
         values: dict[str, Array] = {}
         places: dict[str, Places] = {}

@@ -6,6 +6,7 @@ from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import comb
+from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +15,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import (
     MATRIX_NAMES,
     Array,
+    BoolArray,
     Coefficients,
     CoefficientSource,
     IntArray,
@@ -214,14 +216,24 @@ class TextCoefficients:
                 f"zero near t = {at:.6g}"
             )
 
-    def entries(self, t: Array, order: int, inside: Array | None = None) -> Entries:
+    def entries(
+        self, t: Array, order: int, inside: Array | None = None,
+        moved: Mapping[str, BoolArray] = MappingProxyType({}),
+    ) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
         if self.tables:
             return entries_of(self.taylor(t, order, inside), self.constant)
         apart, places, shared = self._apart
-        values = Coefficients(*apart.taylor(t, order, self._amid(inside)))
+        moved = {name: some for name, some in moved.items() if order and name not in self.constant}
+        inside, jets = self._amid(inside), {}
+        values = Coefficients(*apart.of(MATRIX_NAMES, moved).taylor(t, order, inside))
+        if moved:
+            whole = Coefficients(*apart.taylor(t, 0, inside))
+            for name, some in moved.items():
+                jets[name] = np.where(some, some.cumsum() - 1, -1), getattr(values, name)
+                values = values._replace(**{name: getattr(whole, name)})
         once = {name: getattr(values, name)[:, :1] for name in self.constant}
-        return Entries(values._replace(**once), places, shared)
+        return Entries(values._replace(**once), places, shared, jets)
 
     @cached_property
     def _apart(self) -> tuple[Assembly, dict[str, Places], dict[str, IntArray]]:

@@ -50,15 +50,16 @@ from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_sc
 from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
 
-_CHUNK = 1 << 23  # numbers in one batch of element systems (64 MB)
+_CHUNK = 1 << 20  # numbers in one batch of element systems (8 MB)
 _DIRECT = 400  # unknowns
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _BEYOND = 5.0  # times what the constraints are seen to be missed by, which counts of a bound
 _MODEST = 1e100  # values up to here may be multiplied with each other
 # The C library gives freed memory back to the system, page by page, and takes as much again a
-# moment later, unless it has seen a larger array come and go. This one is never written to.
-np.empty(_CHUNK // 4)
+# moment later, unless it has seen a larger array come and go: up to 32 MB. This one is never
+# written to.
+np.empty((1 << 22) - 4096)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,10 +98,12 @@ def solve(
     def evaluate(
         mesh: Mesh, before: tuple[_Maps, Array, int] | None, kept: IntArray
     ) -> tuple[tuple[_Maps, Array, int], Array]:
-        if before is None:
-            maps = _element_maps(problem, mesh, None, known)
-        else:
-            maps = merged(before[0], _element_maps(problem, mesh, kept < 0), kept)
+        given, fresh = known if before is None else None, kept < 0
+        if fresh.all():
+            before = None  # it would be as much again
+        maps = _element_maps(problem, mesh, fresh, given)
+        if before is not None:
+            maps = merged(before[0], maps, kept)
         values, whole = _chain(maps, problem, mesh, restarts or {})
         tail = _tail_of_numbers(problem, mesh, values, maps, whole, tol)
         return (maps, values, whole), tail
@@ -228,15 +231,12 @@ def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> l
 
 
 def _element_maps(
-    problem: LinearProblem, mesh: Mesh, elements: BoolArray | None,
-    known: LinearEquation | None = None,
+    problem: LinearProblem, mesh: Mesh, elements: BoolArray, known: LinearEquation | None
 ) -> _Maps:
-    """Solve the block systems of some elements, None: all, in chunks of bounded memory."""
+    """Solve the block systems of some elements in chunks of bounded memory."""
     n, columns = problem.start.shape
     s = mesh.rule.stages
-    h, t, inside = mesh.steps, mesh.points, mesh.inside
-    if elements is not None:
-        h, t, inside = h[elements], t[elements], inside[elements]
+    h, t, inside = (each[elements] for each in (mesh.steps, mesh.points, mesh.inside))
     numbers = s * n * (n + columns)
     if known is None or not _is_constant(known):
         numbers += s * s * n * n

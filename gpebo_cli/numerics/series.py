@@ -27,7 +27,7 @@ from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, ra
 from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
-from gpebo_cli.numerics.radau import ComplexArray
+from gpebo_cli.numerics.radau import ComplexArray, RadauRule
 from gpebo_cli.numerics.refinement import refine
 
 LENGTH = 4.0  # h‖A‖ of an element at most
@@ -227,36 +227,49 @@ def _series(
 
     With kicks only values at both ends of each element.
     """
-    size = np.maximum(largest_over_time(A.entries), _TINY)
-    degrees = _degrees(A.entries, size, mesh, tol)
-    terms = _powers(degrees)
+    size, of_f = np.maximum(largest_over_time(A.entries), _TINY), f.reshape(len(f), -1)
+    largest, rule = largest_over_time(of_f), mesh.rule
+    terms = _powers(_degrees(A.entries, size, rule, tol))
     decay = _largest_shares(terms, size)
     later = decay[:, 1:] * (decay[:, 1:] > tol)
     rates = (later ** (1.0 / np.arange(1, decay.shape[1]))).max(axis=1, initial=0.0)
     parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
     parts = np.broadcast_to(parts, mesh.size)
-    if parts.max() > 1:
-        terms = _powers(degrees, parts)
-        decay = _largest_shares(terms, size)
-    del degrees
-    decay = np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1]
-    known = f.reshape(len(f), -1)
-    forced = _powers(_degrees(known, largest_over_time(known), mesh, tol), parts)
-    nodes = mesh.rule.nodes if kicks is None else mesh.rule.nodes[-1:]
-    return elements.series(
-        nodes, mesh.steps, parts, A.rows, A.columns, terms.swapaxes(1, 2), decay,
-        forced.reshape(*forced.shape[:2], *f.shape[1:]), kicks, start, weights, tol, SHARE,
-    )
+    nodes, pieces = rule.nodes if kicks is None else rule.nodes[-1:], []
+    # So many elements at once that they have no more parts than there are elements.
+    count = -(-mesh.size // int(parts.max()))
+    for first in range(0, mesh.size, count):
+        some, forced = slice(first, first + count), np.zeros(0)
+        at = slice(len(rule.points) * first, len(rule.points) * (first + count))
+        if count < mesh.size:
+            terms = np.zeros(0)  # what was there goes before there is more
+            terms = _powers(_degrees(A.entries[at], size, rule, tol), parts[some])
+            decay = _largest_shares(terms, size)
+        there = of_f if len(f) == 1 else of_f[at]
+        forced = _powers(_degrees(there, largest, rule, tol), parts[some])
+        pieces.append(elements.series(
+            nodes, mesh.steps[some], parts[some], A.rows, A.columns, terms.swapaxes(1, 2),
+            np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1],
+            forced.reshape(*forced.shape[:2], *f.shape[1:]),
+            None if kicks is None else kicks[some], start, weights, tol, SHARE,
+        ))
+        start = pieces[-1][0][-1, -1] + (0.0 if kicks is None else kicks[some][-1])
+    if len(pieces) == 1:
+        return pieces[0]
+    del terms, forced
+    values, change = (np.concatenate(each) for each in zip(*pieces, strict=True))
+    return values, change
 
 
-def _degrees(values: Array, size: Array, mesh: Mesh, tol: float) -> Array:
+def _degrees(values: Array, size: Array, rule: RadauRule, tol: float) -> Array:
     """Legendre coefficients (K or 1, g, w) of functions (N or 1, w) in each element.
 
     Degrees that are smaller than ``tol`` of the size (w,) are left out.
     """
     if len(values) == 1:
         return values[None]
-    found = mesh.rule.to_legendre @ values.reshape(*mesh.points.shape, -1)
+    points = len(rule.points)
+    found = rule.to_legendre @ values.reshape(len(values) // points, points, -1)
     counts = (largest_over_time(found) > tol * size).any(axis=1)
     return found[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
 
@@ -271,10 +284,12 @@ def _powers(degrees: Array, parts: IntArray | None = None) -> Array:
         return np.asarray(_legendre_powers(g, 1) @ degrees)
     if len(degrees) == g == 1:
         return degrees
-    found, first = np.empty((parts.sum(), g, w)), parts.cumsum() - parts
+    # Powers of one function follow each other, as series take them.
+    found, first = np.empty((parts.sum(), w, g)).swapaxes(1, 2), parts.cumsum() - parts
     for count in set(parts.tolist()):
-        some, changed = parts == count, _legendre_powers(g, count)
-        found[first[some, None] + np.arange(count)] = changed @ degrees[some, None]
+        some = parts == count
+        for k, changed in enumerate(_legendre_powers(g, count)):
+            found[first[some] + k] = changed @ degrees[some]
     return found
 
 

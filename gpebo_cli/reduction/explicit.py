@@ -14,12 +14,12 @@ it, is left to the derivative array, which has singular values to tell.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -29,7 +29,7 @@ from gpebo_cli.reduction.scaling import Scaling, balance_entries
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
 _SOUND = 0.1  # of the largest entry of its row, in units of the states
 _ROUNDING, _CLEAR = 1e-13, 1e-9  # of what an entry is the difference of: zero below, sure above
-_AT_ONCE = 64  # times, whose entries are there twice while they are copied
+_AT_ONCE = 32  # times, whose entries are there twice while they are copied
 _FILL = 40  # entries per equation; with more of them, a matrix is not sparse
 
 _NOTHING = np.zeros((1, 1))
@@ -59,6 +59,7 @@ class Explicit:
     state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
     weights: Array  # (n,) see ``scaling.Scaling``
+    moved: Mapping[str, BoolArray]  # of which values (v,) of E and A derivatives may be needed
     known: float = 0.0  # sizes of what is known in the states
     loss: float = 1.0  # by how much elimination may have made rounding grow
 
@@ -129,16 +130,11 @@ def _size(a: Array) -> float:
     return float(np.abs(a[0]).max())
 
 
-def _picked(values: Array, some: slice, which: IntArray) -> Array:
-    """Some of the values (orders, N or 1, v) themselves at some of the times, (· or 1, w)."""
-    return values[0, some if values.shape[1] > 1 else slice(None)].take(which, axis=1)
-
-
 class _Equations:
     """Rows of entries; one becomes a mapping where it is touched."""
 
     def __init__(self, found: Entries, name: str, known: Row, units: Array) -> None:
-        n, places = len(units), found.places[name]
+        self.found, self.name, n, places = found, name, len(units), found.places[name]
         order = np.lexsort(places[::-1])
         self.values, self.order = getattr(found.values, name), found.which(name)[order]
         self.place = [place[order] for place in places]  # rows, and columns
@@ -146,7 +142,7 @@ class _Equations:
         self.known = dict(known)  # in those rows that have something
         self.units = units
         self.rows: dict[int, Row] = {}  # those that were touched
-        self.factors, self.divided = np.ones((1, 1, 0)), np.full(n, -1)  # which one a row waits for
+        self.divided = np.full(n, -1)  # by which value of E a row waits to be divided
         self.least = 1.0  # pivot so far, relative to its row
         by_column = np.argsort(self.place[1], kind="stable")
         self._in_column = self.place[0][by_column]
@@ -157,9 +153,9 @@ class _Equations:
         """Row i, to be changed."""
         if i not in self.rows:
             part = slice(self.first[i], self.first[i + 1])
-            values = list(np.moveaxis(self.values[:, :, self.order[part]], 2, 0).copy())
+            values = list(np.moveaxis(self.found.jets(self.name, self.order[part]), 2, 0).copy())
             if self.divided[i] >= 0:
-                values = [product(v, self.factors[:, :, self.divided[i]]) for v in values]
+                values = [product(v, self._factor(i)) for v in values]
             self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
         return self.rows[i]
 
@@ -170,11 +166,21 @@ class _Equations:
             self._where[k] = set(self._in_column[part].tolist())
         return self._where[k]
 
-    def divide(self, rows: IntArray, pivots: Array) -> None:
-        """Divide untouched rows (r,) by pivots (orders, N or 1, r), their entries when needed."""
-        self.factors, self.divided[rows] = _reciprocal(pivots), np.arange(len(rows))
+    def _factor(self, i: int) -> Array:
+        return _reciprocal(self.found.jets("E", self.divided[i, None])[:, :, 0])
+
+    def divide(self, rows: IntArray, pivots: IntArray) -> None:
+        """Divide untouched rows (r,) by values of E (r,), their entries when needed."""
+        self.divided[rows] = pivots
         for i in self.known.keys() & set(rows.tolist()):
-            self.known[i] = product(self.known[i], self.factors[:, :, self.divided[i]])
+            self.known[i] = product(self.known[i], self._factor(i))
+
+    def moved(self) -> BoolArray:
+        """Which of the values (v,) are in rows that were touched."""
+        found = np.zeros(self.values.shape[2], dtype=bool)
+        for i in self.rows:
+            found[self.order[self.first[i] : self.first[i + 1]]] = True
+        return found
 
     def assembled(self, chosen: IntArray, states: IntArray) -> Sparse:
         """Rows ``chosen`` (d,), with columns ``states`` (d,)."""
@@ -190,7 +196,7 @@ class _Equations:
         ]
         i = np.concatenate([position[self.place[0][plain]], [t[0] for t in touched]])
         j = np.concatenate([column[self.place[1][plain]], column[[t[1] for t in touched]]])
-        values = self.values, self.factors, *(t[2][None] for t in touched)
+        values = self.values, self.found.values.E, *(t[2][None] for t in touched)
         count = max(value.shape[1] for value in values)
         order = np.argsort(i, kind="stable")
         place = np.empty(len(i), dtype=np.intp)  # of each entry in the end
@@ -200,10 +206,13 @@ class _Equations:
         factor = self.divided[self.place[0][plain]]
         waiting, factor = place[: plain.sum()][factor >= 0], factor[factor >= 0]
         entries = np.empty((count, len(i)))
-        for first in range(0, count, _AT_ONCE):
+        E, of_all = self.found.values.E[0], (count, self.values.shape[2])
+        np.broadcast_to(self.values[0], of_all).take(
+            of_plain, axis=1, out=entries, mode="clip"  # another mode would copy
+        )
+        for first in range(0, count, _AT_ONCE) if len(waiting) else ():
             some = slice(first, first + _AT_ONCE)
-            entries[some] = _picked(self.values, some, of_plain)
-            entries[some, waiting] *= _picked(self.factors, some, factor)
+            entries[some, waiting] /= (E[some] if len(E) > 1 else E)[:, factor]
         for k, (_, _, value) in zip(place[plain.sum() :].tolist(), touched, strict=True):
             entries[:, k] = value
         rows = np.searchsorted(i[order], np.arange(len(chosen) + 1))
@@ -307,15 +316,18 @@ def explicit_form(found: Entries, scaling: Scaling, f: Row) -> Explicit:
     others, mu = _without_others(A, equation_of)
     states = np.array(sorted(equation_of), dtype=np.intp)
     chosen = np.array([equation_of[k] for k in states.tolist()], dtype=np.intp)
-    matrix = A.assembled(chosen, states)
+    moved, by = {"E": E.moved(), "A": A.moved()}, A.divided[[*A.rows]]
+    moved["E"][by[by >= 0]] = True
     left = tuple(
         (i, {k: a[0].copy() for k, a in row.items()}, phi[0].copy())
         for i, row, phi in (*reversed(others), *shifts)
     )
-    del A.values, A.rows, others, shifts  # what is known comes in the place of all that
+    del others, shifts
+    matrix = A.assembled(chosen, states)
+    del A.rows  # what is known comes in the place of that
     return Explicit(
         states, matrix, A.forcing(chosen), left,
-        count, mu, units, min(E.least, A.least), scaling.weights,
+        count, mu, units, min(E.least, A.least), scaling.weights, moved,
     )
 
 
@@ -324,11 +336,12 @@ def _leading(E: _Equations, A: _Equations) -> dict[int, int]:
     n, (rows, columns) = len(E.units), E.place
     single = np.bincount(rows, minlength=n)[rows] == 1
     single &= np.bincount(columns, minlength=n)[columns] == 1
-    size = np.abs(E.values[0][:, E.order])
-    single &= (size.min(axis=0) >= _STEADY * size.max(axis=0)) & (size.max(axis=0) > 0.0)
-    pivots = E.values[:, :, E.order[single]]
-    if not ((pivots[0] == 1.0).all() and (pivots[1:] == 0.0).all()):
-        A.divide(rows[single], pivots)
+    size = np.abs(E.values[0])
+    least, most = size.min(axis=0)[E.order], size.max(axis=0)[E.order]
+    single &= (least >= _STEADY * most) & (most > 0.0)
+    if len(size) > 1 or (size != 1.0).any():
+        A.divide(rows[single], E.order[single])
+    del size
     equation_of = dict(zip(columns[single].tolist(), rows[single].tolist(), strict=True))
     left: list[int] = sorted(set(rows[~single].tolist()))
     while left:

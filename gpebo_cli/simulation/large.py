@@ -6,12 +6,13 @@ pivots do not tell the structure, is reduced once, by singular values.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
@@ -94,6 +95,7 @@ class _Plant:
         self.scaling: Scaling | None = None  # what nearly is
         self.at: Mesh | None = None  # of both, and
         self.eliminated = False  # whether ``form`` is of ``found``
+        self.moved: Mapping[str, BoolArray] = {}  # what derivatives were needed of, if it is known
 
     def entries(self, mesh: Mesh, every: int = 1) -> Coefficients:
         """Every entry at every so many points of each element."""
@@ -101,7 +103,7 @@ class _Plant:
             vars(self).pop(old, None)  # two of them would be as much again
         self.at, self.eliminated = mesh if every == 1 else None, False
         t, inside = (places[:, ::every].ravel() for places in (mesh.points, mesh.inside))
-        self.found = entries(self.system.coefficients, t, self.order, inside)
+        self.found = entries(self.system.coefficients, t, self.order, inside, self.moved)
         return self.found.values
 
     def eliminate(self, mesh: Mesh, every: int = 1) -> Explicit | ConstantForm:
@@ -112,18 +114,23 @@ class _Plant:
             try:
                 self.form = self._form(self.found, forcing(self.found))
             except MoreOrdersError:
-                if self.order == self.most:
+                if self.moved:
+                    self.moved = {}
+                elif self.order == self.most:
                     raise
-                self.order += 1
+                else:
+                    self.order += 1
                 self.entries(mesh, every)
             else:
                 self.eliminated, values = True, self.found.values
+                if isinstance(self.form, Explicit) and values.A.shape[2] > self.system.n:
+                    self.moved = self.form.moved  # of many values it pays to know that
                 # Nothing else of E and A is needed now, nor of what others are parts of.
                 A = values.A[:1]
                 A = np.maximum(A.max(axis=1, keepdims=True), -A.min(axis=1, keepdims=True))
                 values = values._replace(E=values.E[:, :1], A=A)
                 kept = Coefficients(*(np.array(value[:1]) for value in values))
-                self.found = self.found._replace(values=kept)
+                self.found = self.found._replace(values=kept, moved={})
         return self.form
 
     def _form(self, found: Entries, f: Row) -> Explicit | ConstantForm:

@@ -39,6 +39,7 @@ _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
 _TINY = float(np.finfo(float).tiny)
+_AT_ONCE = 128  # elements of which all equations are held
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
 _LITTLE = 1e-11  # of a state: rounding of constraints of which a bound is below is not looked at
 _SAME = 1e3  # tolerances, by which a closer look moves nothing
@@ -122,9 +123,12 @@ def _solved(
     """:func:`_simulate_linear` of a plant with this structure."""
     start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
-    points = len(mesh.rule.points)
+    # Of many elements some are looked at, and the equations are made where they are solved.
+    few = mesh.size <= _AT_ONCE or structure.time_invariant
+    points, some = len(mesh.rule.points), slice(None, None, 1 if few else mesh.size // _LOOKED_AT)
     first = strangeness_free_form(
-        system, structure, mesh.points.ravel(), mesh.inside.ravel(), c, points
+        system, structure, mesh.points[some].ravel(), mesh.inside[some].ravel(), c if few else None,
+        points,
     )
     del c  # as much as all that is made of it
     independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
@@ -142,7 +146,7 @@ def _solved(
     restarts = _restarts(system, structure, cuts, mesh.edges, happened)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return _equations(strangeness_free_form(system, structure, t, inside, points=points))
+        return _equations(strangeness_free_form(system, structure, t, inside, None, points, 1))
 
     def explicit(t: Array, inside: Array) -> LinearEquation:
         A, f = ivp.underlying_ode(system, structure, t, inside)
@@ -174,10 +178,12 @@ def _solved(
     )
     if independent:
         problem = replace(problem, coefficients=explicit)
+    known = _equations(first) if few else None
     own = partial(
-        ivp.solve if independent else partial(solve, known=_equations(first)), mesh=mesh,
+        ivp.solve if independent else partial(solve, known=known), mesh=mesh,
         tol=solver.tol, max_elements=solver.max_elements, restarts=restarts,
     )
+    del first, known
     try:
         solution = own(problem)
     except RoundingError as error:  # perhaps of states that are zero: others are what counts then
@@ -240,7 +246,12 @@ def _growth_resolved(
     never be seen to grow again: its error is invisible beside the size it once had (SolverError:
     that takes more elements than there may be).
     """
-    n = structure.d + structure.a
+    n, A = structure.d + structure.a, structure.dynamics
+    if A is not None:  # Gershgorin's discs say without eigenvalues whether there is little
+        own = np.diagonal(A, axis1=1, axis2=2)
+        bounds = [(own - np.abs(own) + np.abs(A).sum(axis=k)).max(initial=0.0) for k in (1, 2)]
+        if min(bounds) * float(mesh.steps.max()) <= SHORT:
+            return mesh
     most = min(_MOST_FOR_GROWTH / (mesh.rule.stages * n**2), solver.max_elements)
     parts = np.maximum(1.0, np.ceil(mesh.steps * (structure.growth / SHORT)))
     if parts.sum() > min(most, _MOST_ALIKE):

@@ -7,7 +7,7 @@ and value get the same place on the tape. A tape is flat, so it copies to other 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,7 +16,7 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.model.expressions.jets import Jet
 from gpebo_cli.model.expressions.nodes import Node
@@ -280,6 +280,7 @@ class Assembly:
     fixed: tuple[Array, ...]  # the matrices, zero at the targets
     # What the kernel is given besides times and signals.
     _plans: dict[_Key, tuple[Any, ...] | None] = field(default_factory=dict, init=False)
+    _parts: dict[object, Assembly] = field(default_factory=dict, init=False)  # see ``of``
 
     def taylor(
         self, t: Array, order: int, inside: Array | None = None, signals: Array | None = None
@@ -304,6 +305,22 @@ class Assembly:
                     rows = np.swapaxes(signals, 1, 2).reshape(count, len(t))
                 found = kernels.expressions.jets(t, inside if apart else t, rows, *plan)
         return found or self._placed(self.tape.interpreted(t, order, inside, signals))
+
+    def of(self, names: Sequence[str], some: Mapping[str, BoolArray]) -> Assembly:
+        """With ``some`` entries (v,) of matrices that have these names, and the others as here."""
+        if not some:
+            return self
+        key = tuple((name, own.tobytes()) for name, own in some.items())
+        if key not in self._parts:
+            targets, fixed, there = self.targets.copy(), list(self.fixed), self.targets[:, 0] >= 0
+            for name, own in some.items():
+                k = names.index(name)
+                here, fixed[k] = targets[:, 0] == k, fixed[k].ravel()[own]
+                there[here] = own[targets[here, 1]]
+                targets[here, 1] = (own.cumsum() - 1)[targets[here, 1]]
+            tape = self.tape.of([self.tape.outputs[j] for j in there.nonzero()[0].tolist()])
+            self._parts[key] = Assembly(tape, targets[there], tuple(fixed))
+        return self._parts[key]
 
     def _plan(
         self, order: int, apart: bool, signals: tuple[int, int] | None = None
