@@ -211,3 +211,17 @@ def test_a_long_recording_respects_bounds_in_all_of_its_rows(follows, monkeypatc
         moved = np.abs(free.estimates[name][0] - expected).max()
         assert np.abs(found.estimates[name][0] - expected).max() < 1e-3 * moved
     assert "held by bounds: h1" in found.verdict
+
+
+def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
+    """At 20 s, when b1 leaves its bounds, of its start e⁻⁴⁰ is left."""
+    decaying = {
+        **TANK, "states": ["b1", "b2"], "inputs": {"V": "-step(t - 20)"}, "unknowns": {}, "F": None,
+        "A": [[-2, 0], [1, -2]], "initial_state": {"b1": 1, "b2": 0},
+    }
+    free, bounded = (
+        run(decaying, observer={"name": "gpebo", **bounds}, time={"horizon": 22.0, "samples": 23})
+        for bounds in ({}, {"bounds": {"states": {"b1": [-0.1, None]}}})
+    )
+    assert (bounded.estimates["b1"] == free.estimates["b1"]).all()
+    assert bounded.estimates["b1"][0, -1] == pytest.approx((np.exp(-4.0) - 1.0) / 2.0, rel=1e-4)

@@ -414,3 +414,11 @@ def test_a_component_is_lost_where_its_error_first_exceeds_it(grown, lost):
     problem = LinearProblem(lambda t, inside: None, one)
     errors = judged_errors(problem, carried, carried.max(axis=0), 0 * one, one, 0 * one, one)
     assert errors.lost == lost
+
+
+def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
+    size, one = np.array([[1.0], [1e-11]]), np.ones((2, 1))
+    problem = LinearProblem(lambda t, inside: None, one, units=one)
+    errors = judged_errors(problem, 1e-12 * one[None], 1e-12 * one, 0 * one, size, 0 * one, size)
+    assert not errors.vague(1e-9).any()
+    assert errors.vague(1e-13)[:, 0].tolist() == [False, True]
