@@ -224,4 +224,5 @@ def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
         for bounds in ({}, {"bounds": {"states": {"b1": [-0.1, None]}}})
     )
     assert (bounded.estimates["b1"] == free.estimates["b1"]).all()
+    assert "held by bounds" not in bounded.verdict
     assert bounded.estimates["b1"][0, -1] == pytest.approx((np.exp(-4.0) - 1.0) / 2.0, rel=1e-4)
