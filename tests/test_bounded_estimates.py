@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 
 from gpebo_cli import run
 from gpebo_cli.experiment import bounds as bounds_
+from gpebo_cli.experiment.result import ActiveBound
 from gpebo_cli.observers import gpebo
 
 TANK = {
@@ -226,3 +227,8 @@ def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
     assert (bounded.estimates["b1"] == free.estimates["b1"]).all()
     assert "held by bounds" not in bounded.verdict
     assert bounded.estimates["b1"][0, -1] == pytest.approx((np.exp(-4.0) - 1.0) / 2.0, rel=1e-4)
+
+
+def test_a_bound_of_an_unknown_is_near_itself():
+    bound = ActiveBound("leak", 0.0, None)
+    assert bound.near(bound, 0.1)

@@ -15,6 +15,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
 from gpebo_cli.observers.reduced.regression import Assembled
+from gpebo_cli.observers.reduced.split import axes_frame
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -282,3 +283,9 @@ def test_rounding_is_judged_beside_what_is_measured_of_a_state_too():
     one, none = np.ones((1, 1)), np.zeros((1, 0))
     found = Assembled(none, none, 10 * one, 1e-3 * one[None], 1.0, one[0], one[0] > 0, one, one)
     assert found.lost(1e-10 * one) == pytest.approx(1e-11)
+
+
+def test_axes_of_what_is_differentiated_are_exact():
+    frame = axes_frame(np.diag([2.0, 0.0, 3.0]))
+    assert frame.domain.tolist() == [[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    assert frame.kernel.tolist() == [[0.0], [1.0], [0.0]]
