@@ -478,6 +478,7 @@ def test_log_ticks_are_few(low: int, span: int) -> None:
     panel = style.Panel("y", (style.Curve(np.arange(2.0), ends, "", style.line(0)),), log=True)
     [axes] = style.compose([panel]).axes
     assert 1 <= len(axes.get_yticks()) <= 6
+    assert axes.get_ylim()[0] <= max(ends[0], 1e-300)
 
 
 def test_every_figure_is_found_by_the_name_of_its_file() -> None:
