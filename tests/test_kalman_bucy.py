@@ -229,9 +229,9 @@ def test_no_word_of_noise_is_noise_of_size_zero():
     signals = simulate(system, TimeSettings(horizon=1.0), SOLVER).signals
     none = SignalNoise(np.zeros(system.m), np.zeros(system.r), NoiseSettings().sample_time)
     t, deviations = np.linspace(0.0, 1.0, 5), []
-    for noise, process in ((None, 0.0), (none, {"theta1": 0.0})):
+    for noise in (None, none):
         measured = replace(seen(signals), noise=noise)
-        found = observe(system, measured, SOLVER, name="kalman_bucy", process=process)
+        found = observe(system, measured, SOLVER, name="kalman_bucy")
         deviations.append(np.hstack(found.state_map.deviations(t)))
     np.testing.assert_array_equal(*deviations)
 

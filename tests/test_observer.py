@@ -14,7 +14,6 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
-from gpebo_cli.observers.reduced.regression import Assembled
 from gpebo_cli.observers.reduced.split import axes_frame
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -276,13 +275,6 @@ def test_what_no_output_sees_is_not_excited_by_rounding(g):
     assert not found.excitation.is_ie
     unknown = {name for name, since in found.estimable.items() if since is None}
     assert unknown == {"a", "b", "e0_2"}
-
-
-def test_rounding_is_judged_beside_what_is_measured_of_a_state_too():
-    """Of a state of size 10 that is seen but for 1e-3 of it, 1e-10 is a part of 1e-11."""
-    one, none = np.ones((1, 1)), np.zeros((1, 0))
-    found = Assembled(none, none, 10 * one, 1e-3 * one[None], 1.0, one[0], one[0] > 0, one, one)
-    assert found.lost(1e-10 * one) == pytest.approx(1e-11)
 
 
 def test_axes_of_what_is_differentiated_are_exact():
