@@ -15,7 +15,6 @@ from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearProblem
 
 _MAX_PARTS = 8  # an element is cut into at most this many at once
-_HARDLY = 1.25  # times the tolerance: for less nothing is solved once more
 _ROUNDING = 1e-6  # a tail below may be rounding, which cutting does not make smaller
 # These four decide about rounding. They are chosen on equations of index 2 to 4 that leave few
 # digits, with some room to solutions that are resolved at last; no bound gives them.
@@ -60,7 +59,7 @@ def refine(
         held, found = [found], None  # ``evaluate`` may let go of it
         found, tail = evaluate(mesh, held.pop(), kept)
         poor = tail > tol
-        if not (tail > _HARDLY * tol).any():
+        if not poor.any():
             return mesh, found, tail
         poor &= tail > mesh.blur
         # An element that was cut and is no better than the one it comes from shows rounding.

@@ -60,12 +60,12 @@ class StrangenessFree:
 
 def strangeness_free_form(
     system: DescriptorSystem, structure: Structure, t: Array, inside: Array,
-    c: Coefficients | None = None, points: int = 0, looks: int = _LOOKS,
+    c: Coefficients | None = None, points: int = 0,
 ) -> StrangenessFree:
     """The strangeness-free equations at the times t (N,), one sweep over all of them.
 
     ``c`` are the model's coefficients there to the order μ, where they are at hand; at the last of
-    so many ``points`` each, terms are looked at, and amplification at so many times (``looks``).
+    so many ``points`` each, terms are looked at.
 
     Elimination on the pivots of one reference time where that is well conditioned, singular
     vectors at the times where it is not.
@@ -85,7 +85,7 @@ def strangeness_free_form(
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
-    every = max(1, len(t) // looks)
+    every = max(1, len(t) // _LOOKS)
     found = None if structure.stages else kernels.structure.eliminated(
         E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
     )

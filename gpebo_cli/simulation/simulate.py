@@ -146,7 +146,7 @@ def _solved(
     restarts = _restarts(system, structure, cuts, mesh.edges, happened)
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
-        return _equations(strangeness_free_form(system, structure, t, inside, None, points, 1))
+        return _equations(strangeness_free_form(system, structure, t, inside, points=points))
 
     def explicit(t: Array, inside: Array) -> LinearEquation:
         A, f = ivp.underlying_ode(system, structure, t, inside)
