@@ -232,3 +232,17 @@ def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
 def test_a_bound_of_an_unknown_is_near_itself():
     bound = ActiveBound("leak", 0.0, None)
     assert bound.near(bound, 0.1)
+
+
+def test_bounds_hold_in_any_units():
+    def bounded(unit):
+        plant = {**TANK, "inputs": {"V": f"{unit}*sin(t)"}, "unknowns": {"leak": -0.05 * unit},
+                 "initial_state": {"h1": unit, "h2": 0}}
+        bounds = {"states": {"h1": [LOW * unit, None]}, "unknowns": {"leak": [0, None]}}
+        found = run(
+            plant, observer={"name": "gpebo", "bounds": bounds}, time={"horizon": HORIZON},
+            estimator={"name": "least_squares", "f0": F0},
+        )
+        return found.estimates["h1"][0] / unit
+
+    np.testing.assert_allclose(bounded(1e-6), bounded(1.0), atol=1e-6)
