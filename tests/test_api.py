@@ -36,6 +36,7 @@ from gpebo_cli import (
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
+from gpebo_cli.experiment.limits import paced
 
 
 @pytest.fixture(scope="module")
@@ -417,3 +418,11 @@ def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, sett
         monkeypatch.setattr(f"{experiment}.{name}", 1)
     with pytest.raises(GpeboError, match=f"^{what} would take some .*: solver.max_seconds="):
         run("window", **settings)
+
+
+def test_a_loop_tells_which_share_of_it_is_done():
+    shares = []
+    loop = paced(4, "cases", 1e9, shares.append)
+    for done in (1, 4):
+        loop(done)
+    assert shares == [0.25, 1.0]

@@ -13,6 +13,7 @@ from processes import printed
 
 from gpebo_cli import run
 from gpebo_cli.experiment.assumptions import examine, warnings
+from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers._base import largest_entry
 from gpebo_cli.settings import Settings
@@ -154,3 +155,17 @@ def test_an_impulse_ends_the_check_by_its_name():
     names = found(system)
     assert not names["No impulses"].holds
     assert list(names)[-1] == "No impulses"
+
+
+def test_what_is_zero_but_for_rounding_does_not_jump():
+    """x3 follows x1 + x2, and x4 = x1 + x2 − x3."""
+    decay = np.diag([-1, -1, -1, -1])
+    decay[3, :3] = [1, 1, -1]
+    system = lti(
+        A=decay.tolist(), E=np.diag([1, 1, 1, 0]).tolist(), states=["x1", "x2", "x3", "x4"],
+        inputs={"u": "step(t - 1)"}, B=[[1], [2], [3], [0]], C=[[1, 0, 0, 0]],
+        initial_state=[100, 200, 300, 0],
+    )
+    simulated = run_experiment(Settings({}, observer={"name": "none"}), system).simulation
+    assert simulated.jumps == ()
+    assert 0.0 < np.abs(simulated.states[:, 3]).max() < 1e-9

@@ -14,6 +14,7 @@ from scipy.optimize import brentq
 
 from gpebo_cli import run
 from gpebo_cli.experiment import bounds as bounds_
+from gpebo_cli.experiment.result import ActiveBound
 from gpebo_cli.observers import gpebo
 
 TANK = {
@@ -211,3 +212,37 @@ def test_a_long_recording_respects_bounds_in_all_of_its_rows(follows, monkeypatc
         moved = np.abs(free.estimates[name][0] - expected).max()
         assert np.abs(found.estimates[name][0] - expected).max() < 1e-3 * moved
     assert "held by bounds: h1" in found.verdict
+
+
+def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
+    """At 20 s, when b1 leaves its bounds, of its start e⁻⁴⁰ is left."""
+    decaying = {
+        **TANK, "states": ["b1", "b2"], "inputs": {"V": "-step(t - 20)"}, "unknowns": {}, "F": None,
+        "A": [[-2, 0], [1, -2]], "initial_state": {"b1": 1, "b2": 0},
+    }
+    free, bounded = (
+        run(decaying, observer={"name": "gpebo", **bounds}, time={"horizon": 22.0, "samples": 23})
+        for bounds in ({}, {"bounds": {"states": {"b1": [-0.1, None]}}})
+    )
+    assert (bounded.estimates["b1"] == free.estimates["b1"]).all()
+    assert "held by bounds" not in bounded.verdict
+    assert bounded.estimates["b1"][0, -1] == pytest.approx((np.exp(-4.0) - 1.0) / 2.0, rel=1e-4)
+
+
+def test_a_bound_of_an_unknown_is_near_itself():
+    bound = ActiveBound("leak", 0.0, None)
+    assert bound.near(bound, 0.1)
+
+
+def test_bounds_hold_in_any_units():
+    def bounded(unit):
+        plant = {**TANK, "inputs": {"V": f"{unit}*sin(t)"}, "unknowns": {"leak": -0.05 * unit},
+                 "initial_state": {"h1": unit, "h2": 0}}
+        bounds = {"states": {"h1": [LOW * unit, None]}, "unknowns": {"leak": [0, None]}}
+        found = run(
+            plant, observer={"name": "gpebo", "bounds": bounds}, time={"horizon": HORIZON},
+            estimator={"name": "least_squares", "f0": F0},
+        )
+        return found.estimates["h1"][0] / unit
+
+    np.testing.assert_allclose(bounded(1e-6), bounded(1.0), atol=1e-6)

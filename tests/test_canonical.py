@@ -138,17 +138,17 @@ def test_an_entry_that_is_rounding_shows_no_state():
     np.testing.assert_allclose(*found, rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("N32", [-0.75, 0])
+@pytest.mark.parametrize("N32", [-0.75, 0, -1e-15])
 def test_remark_4_gain_for_constant_coefficients(N32):
     """a1 c1/c2 > 0 and constant: Remark 4's L_w gives a stable M_w, and all evidence is closed."""
-    mapping = {"N21": 1, "N31": 0.5, "N32": N32, "c1": 1, "c2": 2}
+    mapping = {"N21": -1, "N31": -0.5, "N32": N32, "c1": -1, "c2": 2}
     A = np.diag([0.05, -0.5, 1.0, 1.0, 1.0]).tolist()
     C = [[0, 0, 0, 0, 0], [1, 1, 0, 0, 0], [0.5, 0, "c1", "c2", 0]]
     system = shipped("canonical", parameters=mapping, A=A, C=C, outputs=["none", "y1", "y2"])
     result = run(system, L_w="remark4")
     found = {a.name: a for a in result.assumptions}
     assert found["Assumption 3"].evidence["outputs"] == "y1"
-    assert found["Assumption 4"].holds == (N32 != 0)
+    assert found["Assumption 4"].holds == (N32 == -0.75)
     assert found["Assumption 4"].evidence == {"smallest": abs(N32)}
     assert found["Growth of Φ"].evidence["rate"] == pytest.approx(0.05)
     seven = found["Assumption 7"]

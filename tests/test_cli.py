@@ -195,6 +195,7 @@ WRONG = [
     (["run", "-m", "time.horizon=range(0,1,1e-6)", "plant=window,circuit"], "of 2000000 jobs"),
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 has no keys; give it as a whole"),
     (["run", "time.samples.foo=1"], "time.samples has no keys; give it as a whole"),
+    (["run", "hydra.job.env_set={X: 1}"], "no such key; '+hydra.job.env_set.X=VALUE' adds one"),
     (["run", "plant.states.foo=1"], "base 10: 'foo'; a choice is one name, a list is given"),
     (["run", "plant.title='a\udcff'"], "is not text in UTF-8"),
     (["run", "+launcher=null"], "cannot be composed: Config group override must be"),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import trapezoid
 from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
@@ -22,6 +23,7 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
+from gpebo_cli.numerics.rounding import noise_of
 from tests.kernel_paths import by_both
 
 
@@ -322,6 +324,14 @@ def noisy(t, share):
     return np.cos(3 * t) + share * np.sin(1e17 * t)
 
 
+def test_rounding_of_times_moves_what_varies_by_their_size():
+    """Rounding of t by ε t changes cos(2πt) by up to 2π ε t |sin(2πt)|, besides ε |cos(2πt)|."""
+    t = np.linspace(0.0, 1.0, 9)
+    swing = LinearEquation(None, np.cos(2 * np.pi * t)[:, None, None], np.zeros((9, 1, 1)))
+    truth = trapezoid(np.abs(swing.A[:, 0, 0]) + 2 * np.pi * t * np.abs(np.sin(2 * np.pi * t)), t)
+    assert truth < noise_of(t[-1:], t[None], swing)[0, 0, 0] < 2 * truth
+
+
 def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     """A wave that is as small and fast is resolved: cuts change nothing first, and then they do."""
     rule = radau_rule(14)
@@ -336,7 +346,7 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
         return on, sizes
 
     limits = {"tol": 1e-12, "max_elements": 200_000, "name": "signal"}
-    on, sizes = evaluate(lambda t: noisy(t, t > 5.0))
+    on, sizes = evaluate(lambda t: noisy(t, t > 5.0) + 9 * (t > np.e))  # a jump is none
     with pytest.raises(SolverError, match=r"near t = [5-9].*rounding in its .*solver\.tol above"):
         resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)
     assert max(sizes) < 5000
@@ -404,3 +414,11 @@ def test_a_component_is_lost_where_its_error_first_exceeds_it(grown, lost):
     problem = LinearProblem(lambda t, inside: None, one)
     errors = judged_errors(problem, carried, carried.max(axis=0), 0 * one, one, 0 * one, one)
     assert errors.lost == lost
+
+
+def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
+    size, one = np.array([[1.0], [1e-11]]), np.ones((2, 1))
+    problem = LinearProblem(lambda t, inside: None, one, units=one)
+    errors = judged_errors(problem, 1e-12 * one[None], 1e-12 * one, 0 * one, size, 0 * one, size)
+    assert not errors.vague(1e-9).any()
+    assert errors.vague(1e-13)[:, 0].tolist() == [False, True]

@@ -168,6 +168,19 @@ def test_no_piece_between_jumps_goes_unprobed():
     assert np.unique(probed).tolist() == list(range(1, len(pieces) + 1))
 
 
+@pytest.mark.parametrize(("E", "A", "message"), [
+    # Zero at the first probe alone, where of six equations five are left.
+    ([[1, 0], [0, "t - 1e-3"]], [[-1, 1], [1, -1]], r"from 5 at t = 0\.001 to 6 at t = 0\.01"),
+    ([["exp(680*t)", 0], [0, 0]], [["exp(-680*t)", 1], ["exp(680*t)", 0]], "than numbers hold"),
+])
+def test_why_a_structure_cannot_be_told(E, A, message):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b"], "E": E, "A": A, "initial_state": [1, 1],
+    })
+    with pytest.raises(ModelError, match=message):
+        analyse(plant, 0.0, 1.0, max_mu=2, rank_tol=1e-10)
+
+
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     """a' = l, b' = 3l − b, 0 = a + b: 3a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""

@@ -22,7 +22,7 @@ from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_l
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
-from gpebo_cli.estimators.ls_drem import LsDrem
+from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -237,6 +237,15 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
     assert np.abs(found.memory.values / exact - 1.0).max() < 1e-6
     with pytest.raises(SolverError, match=r"estimator\.beta = 1e\+15 .*; lower it"):
         information(constant, 1.0, f0, 1e15, bound)
+
+
+def test_what_is_mixed_keeps_the_digits_of_small_columns():
+    """Of Y = ψη without noise 𝐘/Δ is η, though eigenvectors of G hide the small column's share."""
+    units, t = np.array([1.0, 1e-6, 1.0]), np.array([5.0, 9.0])
+    made = regression(lambda t: three(t) * units, ETA / units)
+    path = mix_least_squares(information(made, 1.0, 1.0, 0.0, None), 1.0, 1.0, t)
+    delta, Y, _ = path.signals(t, t)
+    np.testing.assert_allclose(Y / delta[:, None], [ETA / units] * 2, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["least_squares", "ls_drem", "fct"])

@@ -159,6 +159,11 @@ def test_norms_that_start_at_rounding_have_settled_at_once():
     np.testing.assert_array_equal(found[:2, 0], 0.0)
     assert (found[:2, 1] > 2.0).all()
     assert (found[:2, 1] < 3.0).all()
+    unknown = np.full((2, 1), np.nan)
+    found = measure_squares(
+        t, (squares, squares), unknown, np.zeros((2, 1)), np.ones(1, dtype=bool)
+    )
+    assert np.isnan(found[[0, 2]]).all()
 
 
 def test_time_rms():
@@ -174,3 +179,9 @@ def test_evidence_at_all_times_is_computed_when_it_is_read_and_pickled_as_number
     np.testing.assert_array_equal(back.pe_level, found.pe_level)
     assert vars(found)["_pe_level"] is found.pe_level
     assert back.level == found.normalised_min[-1] == found.known.smallest[-1]
+
+
+def test_sizes_of_terms_are_those_of_the_element_of_each_time():
+    scale = np.arange(12.0).reshape(4, 3)
+    made = replace(regression(three, ETA, elements=4), scale=scale)
+    assert (made.terms(np.array([1.0, 4.0, 6.0, 9.0])) == scale).all()

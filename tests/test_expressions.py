@@ -437,6 +437,7 @@ def test_values_that_are_no_expressions_are_refused(value: object) -> None:
         ("t.x", "attribute"),
         ("t > 1", "'>'"),
         ("C1 +", "not an expression"),
+        ("t" + " " * 99_998 + "+", "not an expression"),
         ("(" * 300 + "t" + ")" * 300, "it is nested too deeply"),
         ("-" * 3000 + "t", "it is nested too deeply"),
         ("-" * 201 + "t", "it is nested more than 200 deep"),

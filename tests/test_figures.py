@@ -373,7 +373,7 @@ IN_MATHEMATICS = {
     "flow_of_tank": r"$\mathrm{flow}_{\mathrm{of},\mathrm{tank}}$",
 }
 NUMBERS = {1e10: "10¹⁰", -1e-7: "−10⁻⁷", 2.5e-7: "2.5·10⁻⁷", 0.5: "0.5", 0.0: "0",
-           9999.0: "9999", -3.25: "−3.25"}
+           9999.0: "9999", 1.5e4: "1.5·10⁴", -3.25: "−3.25"}
 GAINS = {"gamma": "γ", "gamma_2": "γ₂", "f0": "f₀", "lambda_1": "λ₁", "window": "window"}
 
 
@@ -478,6 +478,7 @@ def test_log_ticks_are_few(low: int, span: int) -> None:
     panel = style.Panel("y", (style.Curve(np.arange(2.0), ends, "", style.line(0)),), log=True)
     [axes] = style.compose([panel]).axes
     assert 1 <= len(axes.get_yticks()) <= 6
+    assert axes.get_ylim()[0] <= max(ends[0], 1e-300)
 
 
 def test_every_figure_is_found_by_the_name_of_its_file() -> None:

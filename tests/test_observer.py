@@ -14,6 +14,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
+from gpebo_cli.observers.reduced.split import axes_frame
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -274,3 +275,9 @@ def test_what_no_output_sees_is_not_excited_by_rounding(g):
     assert not found.excitation.is_ie
     unknown = {name for name, since in found.estimable.items() if since is None}
     assert unknown == {"a", "b", "e0_2"}
+
+
+def test_axes_of_what_is_differentiated_are_exact():
+    frame = axes_frame(np.diag([2.0, 0.0, 3.0]))
+    assert frame.domain.tolist() == [[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
+    assert frame.kernel.tolist() == [[0.0], [1.0], [0.0]]

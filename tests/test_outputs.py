@@ -19,6 +19,7 @@ from processes import read_table, refused
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.results import files, tables
+from gpebo_cli.results.finished import span
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import GitState, Provenance, git_state, provenance
 from gpebo_cli.results.summary import strict, summary_text
@@ -364,3 +365,10 @@ def test_tables_need_neither_matplotlib_nor_pandas() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("content", ["", "t,y\n", "y\n0\n1\n", "t\n0\nx\n"])
+def test_what_is_no_signals_has_no_span(content, tmp_path):
+    (tmp_path / "signals.csv").write_text(content, encoding="utf-8")
+    with refused("signals.csv: not the signals of a run", by=GpeboError):
+        span(tmp_path)

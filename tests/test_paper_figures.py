@@ -322,6 +322,10 @@ def test_a_difference_says_which_curve_where_and_by_how_much(tmp_path: Path) -> 
         r"\S+ is allowed",
         text,
     )
+    t = np.linspace(0.0, 1.0, 41)
+    moved = np.maximum(t, 0.01)  # where the reference is zero
+    one, other = ([Panel("y", (Curve(t, y, "", line(0)),))] for y in (moved, t))
+    assert len(compare(one, other, tmp_path)) == 1
 
 
 def test_rounding_is_no_difference(tmp_path: Path) -> None:

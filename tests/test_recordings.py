@@ -957,3 +957,9 @@ def test_pauses_are_said(hold, told, tmp_path):
     file = write_table(tmp_path / "r.csv", {"t": t, "u": np.sin(t), "y": np.cos(t)})
     said = run("descriptor", data={"file": file, "hold": hold}).verdict
     assert f"through 1 pause of up to 3.1 s {told}" in said
+
+
+def test_errors_on_lines_have_the_steps_on_both_sides():
+    """The corners of a hat over steps 1, 2 and 4 have the parts 1/4, 1/2 and 1/4."""
+    found = Rows(np.array([0.0, 1.0, 3.0, 7.0]), "linear").intensities(np.array([1.5]))
+    assert found == pytest.approx([0.25 * (1.0 + 2.0 * 2.0 + 4.0)])

@@ -212,6 +212,15 @@ def test_the_regression_holds_in_every_segment(name):
         np.testing.assert_allclose(reset.parameters(before), after, atol=1e-8)
 
 
+def test_growth_is_that_of_the_longest_segment():
+    """Of e^t over one, two and one seconds."""
+    plant = plant_from_mapping(one_state(
+        states=["a", "b"], E=[[1, 0], [0, 1]], A=[[1, 0], [1, 0]], C=[[0, 1]], initial_state=[1, 0]
+    ))
+    found = along(plant, 4.0, remedy="reset", reset_times=[1.0, 3.0])[1]
+    assert found.growth == pytest.approx(np.exp(2.0), rel=1e-8)
+
+
 def test_the_gram_matrix_goes_on_through_a_reset():
     system, signals, observation = observed("mixed", remedy="reset", reset_interval=4.0)
     regression = observation.regression

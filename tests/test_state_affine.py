@@ -72,6 +72,7 @@ def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     effort = simulate(boost(), TimeSettings(horizon=3.0), SOLVER).effort
     assert effort.windows == 1
     assert effort.linear_solves <= 4
+    assert 0.0 < effort.last_change <= SOLVER.tol
 
 
 def test_a_run_says_what_newtons_method_cost():

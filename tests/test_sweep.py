@@ -9,8 +9,10 @@ import re
 import signal
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from omegaconf import OmegaConf
 from plants import DECAYING
 from processes import assert_refused, begin, printed, rows_of, wait_for
 from processes import process as gpebo
@@ -19,7 +21,7 @@ from scipy.integrate import trapezoid
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
-from gpebo_cli.cli.sweep import _overrides
+from gpebo_cli.cli.sweep import _launch, _overrides
 from gpebo_cli.cli.sweep_progress import Watch
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.results import sweep_folder
@@ -125,6 +127,16 @@ def test_figures_when_they_are_asked_for(tmp_path):
 
 
 # Failures -------------------------------------------------------------------------------------
+
+
+def test_what_a_launcher_refuses_is_no_launcher_that_gave_up(tmp_path):
+    """Wrong words are the user's to change, and said as such."""
+    def launch(batch, initial_job_idx):
+        raise ConfigError(str(batch[initial_job_idx][0]))
+
+    orders = OmegaConf.create({"max_batch_size": None, "fail_fast": False})
+    with pytest.raises(ConfigError, match="n=1"):
+        _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
 
 
 def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):

@@ -117,6 +117,8 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     missing = missing or str(getattr(cause, "key", ""))  # of a mapping that was given as a whole
     full = f"{path}.{missing}" if path else missing
     if not known:
+        if path.startswith("hydra."):  # its mappings take no new keys, in whichever way they come
+            return f"{full}: no such key; '+{full}=VALUE' adds one"
         return (
             f"{full}: {path} has no keys; give it as a whole, where it takes names as in "
             f"'{path}={{{missing}: VALUE}}'"

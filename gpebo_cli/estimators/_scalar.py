@@ -169,7 +169,7 @@ def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, floa
     is more than nothing, what is rounding of 𝐘/Δ does not count.
     """
     quotient = path.quotient
-    size = max(np.abs(quotient[-1]).max(initial=0.0), np.abs(start).max(), path.floor)
+    size = max(np.abs(path.clearest).max(initial=0.0), np.abs(start).max(), path.floor)
     length = np.maximum(path.energy[:, 1:] - path.energy[:, :-1], 0.0)
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(quotient[:, 1:] - quotient[:, :-1])

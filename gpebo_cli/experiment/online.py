@@ -152,7 +152,8 @@ class Online:
         known = knowledge_of_roots(S, scale, t - self.start, self._tol)
         smallest = sigma.min(axis=1, initial=np.inf) ** 2
         if self._rho is None:
-            reached = known.margin >= 1.0, (known.margin >= 1.0) & (known.smallest >= WELL)
+            exciting = known.margin >= 1.0
+            reached = exciting, exciting & (known.smallest >= WELL)
         else:
             reached = smallest >= self._rho, smallest >= self._rho
         for k, holds in enumerate(reached):
