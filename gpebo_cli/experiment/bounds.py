@@ -207,7 +207,8 @@ class BoundedEstimates:
                     break
         told: list[ActiveBound] = []
         near = _NEAR * (grid[-1] - grid[0])
-        for row in active:
+        # In which order they were found depends on the units.
+        for row in sorted(active, key=lambda row: (row.time or -np.inf, row.side.place)):
             bound = ActiveBound(row.side.name, row.side.value, row.time)
             if not any(bound.near(other, near) for other in told):
                 told.append(bound)
