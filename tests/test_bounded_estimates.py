@@ -252,7 +252,8 @@ def test_bounds_are_told_in_the_order_of_time():
     """Programmes find them in another one."""
     plant = {
         "name": "three", "states": ["h1", "h2", "h3"], "inputs": {"V": "sin(t)"}, "outputs": ["y"],
-        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "A": [[-0.8, -0.5, 0], [1, -0.5, 0], [3e5, 0, -0.2]],
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "A": [[-0.8, -0.5, 0], [1, -0.5, 0], [3e5, 0, -0.2]],
         "B": [[1], [0], [0]], "C": [[0, 1, 1e-7]], "initial_state": {"h1": 1, "h2": 0, "h3": 5e5},
     }
     bounds = {"h3": [-6.1e4, 7.2349e5], "h1": [-0.8876, 1.0]}
