@@ -424,7 +424,7 @@ def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
     """z at each node from that at the left end and from e, z' = A z + B e; (K, s, d, d + c).
 
     A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,). Errors
-    go from ζ to filters and from there to the law: A is block triangular, and solved by its blocks.
+    go from ζ to filters and from there to the law: a large A is solved by its triangle of blocks.
     """
     d, c = B.shape[2:]
     size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)

@@ -207,8 +207,8 @@ class BoundedEstimates:
                     break
         told: list[ActiveBound] = []
         near = _NEAR * (grid[-1] - grid[0])
-        # In which order they were found depends on the units.
-        for row in sorted(active, key=lambda row: (row.time or -np.inf, row.side.place)):
+        # Unknowns first, then by time: in which order they were found depends on the units.
+        for row in sorted(active, key=lambda row: (row.time is not None, row.time or 0.0)):
             bound = ActiveBound(row.side.name, row.side.value, row.time)
             if not any(bound.near(other, near) for other in told):
                 told.append(bound)
