@@ -97,8 +97,11 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert names["Growth of Φ"].evidence["rate"] == pytest.approx(1.0, rel=1e-9)
     assert not names["Growth of Φ"].holds
     assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
-    falls = found(plant_from_mapping(one_state(A=[[-1]])))["Growth of Φ"]
-    assert falls.evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
+    falls = plant_from_mapping(one_state(A=[[-1]]))
+    assert found(falls)["Growth of Φ"].evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
+    short = run(falls, observer={"name": "gpebo", "sample_time": 0.1}, time={"horizon": 0.5})
+    (at_samples,) = [each for each in short.details.assumptions if each.name == "Growth of Φ"]
+    assert at_samples.evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
     assert [largest_entry(np.array([0.25, sign * 0.5])) for sign in (1, -1)] == [0.5, 0.5]
 
 

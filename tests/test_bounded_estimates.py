@@ -232,6 +232,8 @@ def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():
 def test_a_bound_of_an_unknown_is_near_itself():
     bound = ActiveBound("leak", 0.0, None)
     assert bound.near(bound, 0.1)
+    assert not bound.near(ActiveBound("other", 0.0, None), 0.1)
+    assert not ActiveBound("leak", 0.0, 1.0).near(ActiveBound("leak", 0.0, 2.0), 0.1)
 
 
 def test_bounds_hold_in_any_units():

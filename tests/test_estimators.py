@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import fields, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
+from scipy.integrate import trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
@@ -879,6 +881,17 @@ def test_so_they_are_of_several_recordings(tmp_path):
     details = gpebo_cli.run("descriptor", estimator=slow, data=several).details
     assert details.estimation.requirement.holds
     assert "least squares over the same data" in "".join(details.warnings)
+
+
+def test_a_warning_says_how_much_of_the_data_estimates_leave():
+    slow = {"name": "ls_drem", "gamma": 1.5, "f0": 0.01, "initial": 1e5}
+    details = gpebo_cli.run("descriptor", estimator=slow).details
+    r, eta = details.regression, details.estimation.parameters[0, -1]
+    power = [trapezoid((Y**2).sum(axis=1), r.t) for Y in (r.Y - r.psi @ eta, r.Y)]
+    (said,) = re.findall(r"over the same data, which leaves (\S+) of Y and they (\S+):",
+                         "".join(details.warnings))
+    assert float(said[0]) < 1e-6
+    assert float(said[1]) == pytest.approx(np.sqrt(power[0] / power[1]), rel=0.06)
 
 
 @pytest.mark.parametrize(("group", "path"), [

@@ -105,13 +105,14 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
         ({"E": np.eye(5)}, r"E has shape \(5, 5\), expected \(6, 6\)"),
         ({"u": None}, "B and u go together"),
         ({"names": Names(states=("a", "b"))}, "2 names of states for 6 of them"),
-        ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(1, 5, 6\)"),
-        ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1"),
+        ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(3, 5, 6\)"),
+        ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1$"),
+        ({"A": lambda t: circuit_A(t) / (t < 2)[:, None, None]}, "A is not finite at t = 2$"),
     ],
 )
 def test_what_does_not_fit_is_named(changes, message):
     with np.errstate(all="ignore"), pytest.raises(ConfigError, match=message):
-        circuit(**changes).coefficients.taylor(np.array([1.0]), 0)
+        circuit(**changes).coefficients.taylor(np.array([1.0, 2.0, 3.0]), 0)
 
 
 def test_a_large_plant():

@@ -189,6 +189,7 @@ def test_the_index_is_what_topology_says(branches):
         return
     index = simulated(draft.mapping(), 1.0).details.simulation.index
     assert index == 2 if topology.index == 2 else index <= 1
+    assert ("no loop of capacitors" in str(topology)) == (topology.index < 2)
 
 
 def test_names_that_are_there_twice():

@@ -213,9 +213,9 @@ class Online:
 
     @property
     def growth_rate(self) -> float | None:
-        """In 1/s, the logarithm of the largest entry of Φ over the time so far."""
-        elapsed, growth = self.reached.t - self.start, self.growth
-        return float(np.log(growth)) / elapsed if elapsed > 0 and growth else None
+        """In 1/s, ln ‖Φ‖₂ over the time so far."""
+        elapsed, logarithm = self.reached.t - self.start, self.reached.log_norm
+        return logarithm / elapsed if elapsed > 0 and logarithm is not None else None
 
     @property
     def error_estimate(self) -> float:

@@ -342,6 +342,10 @@ class Reached(Protocol):
         """Largest entry of Φ so far; None where there is no Φ."""
 
     @property
+    def log_norm(self) -> float | None:
+        """ln ‖Φ‖₂ at that sample; None where there is no Φ."""
+
+    @property
     def error_estimate(self) -> float:
         """Error estimate of what is integrated between samples, so far."""
 

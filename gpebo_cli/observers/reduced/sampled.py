@@ -24,7 +24,13 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import ByName, InitialError, SampledBlock, largest_entry
+from gpebo_cli.observers._base import (
+    ByName,
+    InitialError,
+    SampledBlock,
+    largest_entry,
+    log_norm,
+)
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
@@ -62,6 +68,7 @@ class SampledState:
     row: Array  # (rows, p + 1) [ψ | Y]
     scale: Array  # (p,) largest terms of the columns of ψ before cancellation so far
     growth: float  # largest entry of Φ so far
+    log_norm: float  # ln ‖Φ‖₂
     injectivity: float  # bound of Assumption 1's singular value so far
     error_estimate: float  # of the integration between samples, so far
 
@@ -182,7 +189,7 @@ class SampledObserver(Formulation):
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         state = SampledState(
             float(t[-1]), signals[-1, : system.m], signals[-1, system.m :], z[-1], rows[-1],
-            scale[-1], growth, smallest, error,
+            scale[-1], growth, log_norm(Phi[-1]), smallest, error,
         )
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]),
