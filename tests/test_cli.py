@@ -138,7 +138,7 @@ WRONG = [
     (["plant=circuit"], "did you mean `gpebo run plant=circuit`?"),
     (["list", "plans"], "did you mean plants?"),
     (["list", "--config-dir", "nowhere"], "--config-dir nowhere: there is no such folder"),
-    (["run", "plant=circut"], "plant=circut: there is no such plant"),
+    (["run", "plant=circut"], "error: plant=circut: there is no such plant"),
     (["run", "plant=circut"], "did you mean circuit?"),
     (["run", "plant=nan"], "plant=nan: there is no such plant"),
     (["run", "estimator=1e3"], "estimator=1e3: there is no such estimator"),
