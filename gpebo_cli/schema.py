@@ -99,6 +99,8 @@ def read(cls: type[T], mapping: object, where: str) -> T:
     """
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{where}: expected a mapping of keys to values, got {shown(mapping)}")
+    if not is_dataclass(cls):
+        raise TypeError(f"{cls!r} is not a dataclass")
     hints = _hints(cls)  # annotations are text, which is compiled to read it
     by_key, known = _by_key(cls), keys(cls)
     for key in mapping:

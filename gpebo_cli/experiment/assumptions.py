@@ -69,12 +69,11 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, []
         )
-    found: list[Assumption] = []
     try:
         simulation = simulation_of(system, settings.time, settings.solver)
     except ModelError as error:
         return Examination((Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),))
-    found += of_simulation(system, simulation)
+    found = of_simulation(system, simulation)
     if observer is None:
         return Examination(tuple(found))
     if any(jump.impulses.any() for _, _, jump in simulation.jumps):

@@ -23,7 +23,7 @@ from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
-from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
+from gpebo_cli.experiment.bounds import bounded
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
@@ -163,7 +163,7 @@ def _completed(
         found.left_out, estimation.active,
     )
     notes = observed.note + note + simulation_note(simulation, found.settings.solver.tol)
-    notes += functions_note(system, simulation or recording)
+    notes += functions_note(system, found.signals)
     notes += recording.note if recording else ""
     return replaced(
         found, excitation=excitation, estimation=estimation, metrics=metrics,
@@ -363,11 +363,11 @@ def _estimate(
     about_own = observation.names is None and observation.estimator is None
     determined = known.parameters[-1] if about_own else np.ones(p, dtype=bool)
     seen = seen if about_own else np.ones(n, dtype=bool)
-    about = observation, grid, kept, known.independent
-    estimates, columns = _estimates(estimator, *about)
-    requirement = estimates.requirement
+    plain, columns = _estimates(estimator, observation, grid, kept, known.independent)
+    requirement, held = plain.requirement, None
     if observation.bounds:
-        estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
+        held = bounded(observation.bounds, system, observation, columns, plain, grid)
+    estimates = held or plain
     told = accuracy.told(determined), accuracy.told(seen)
     natural = accuracy.natural_sizes(regression, p)
     sizes = accuracy.sizes_of(truth, natural, x)
@@ -393,9 +393,9 @@ def _estimate(
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
         cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
-        true_parameters=truth[chosen], states=estimated, delta=lambda: estimates.delta(kept),
+        true_parameters=truth[chosen], states=estimated, delta=lambda: plain.delta(kept),
         checks=state_map.checks(kept, estimated), requirement=requirement, explaining=explaining,
-        active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
+        active=held.active if held else {},
         doubts=(lambda: _doubts(
             settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
             columns, requirement,

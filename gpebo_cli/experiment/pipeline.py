@@ -25,7 +25,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import functions_note, verdict
+from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
@@ -103,12 +103,11 @@ def run_experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    note = functions_note(system, source.simulation or source.recording)
     of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation, regression=None,
         excitation=None, estimation=None, metrics=None, timings=seconds,
-        assumptions=lambda: tuple(of_source()), verdict=source.verdict + note,
+        assumptions=lambda: tuple(of_source()), verdict=source.verdict,
         recording=source.recording,
     )
     if observer is None or estimator is None:

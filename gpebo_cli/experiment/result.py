@@ -61,6 +61,7 @@ class SignalsResult:
     elements: int
     measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
     measured_outputs: Array | None = None  # (N, r)
+    bounded: bool = True  # known functions are, between the times at which they are evaluated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +75,6 @@ class RecordingResult(SignalsResult):
     first: float  # times of its first and last sample
     last: float
     known_states: tuple[str, ...]
-    bounded: bool  # known functions are, between the times at which they are evaluated
     note: str = ""  # what the last line of a run has to say of it, from "; " on
 
 
@@ -94,7 +94,6 @@ class SimulationResult(SignalsResult):
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
     vague: tuple[str, ...] = ()  # states of which few digits are known
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
-    bounded: bool = True  # known functions are, between the times at which they are evaluated
 
 
 @dataclass(frozen=True)

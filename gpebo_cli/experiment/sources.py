@@ -13,7 +13,12 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import of_simulation
 from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure, noise_levels
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
-from gpebo_cli.experiment.verdict import pauses_note, rows_note, simulation_verdict
+from gpebo_cli.experiment.verdict import (
+    functions_note,
+    pauses_note,
+    rows_note,
+    simulation_verdict,
+)
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -46,7 +51,7 @@ class Source:
     theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
     judged: slice  # parameters that count when estimates are compared with the truth
     assumptions: Callable[[], Sequence[Assumption]]  # of the plant, when they are asked for
-    verdict: str
+    verdict: str = ""  # where nothing is estimated
     derivatives: InputDerivatives | None = None  # of the inputs, as far as they are known
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
@@ -89,7 +94,7 @@ def simulated(
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
         theta=system.theta_at, judged=_judged(system),
         assumptions=partial(of_simulation, system, simulation),
-        verdict=simulation_verdict(simulated),
+        verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
         true=simulation.signals, simulation=simulated,
     )
@@ -105,7 +110,7 @@ def recorded(
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
         theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
-        assumptions=tuple, verdict="", derivatives=recording.derivatives,
+        assumptions=tuple, derivatives=recording.derivatives,
         rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
             **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
@@ -124,14 +129,14 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
 
     ConfigError: names the key and what it may be.
     """
-    time, recorded = settings.time, settings.data.name == "csv"
-    if recorded and settings.observer["name"] == "none":
-        raise ConfigError(
-            "observer=none simulates the plant, and data=csv does not; choose one of them"
-        )
-    if recorded:
+    if settings.data.name == "csv":
+        if settings.observer["name"] == "none":
+            raise ConfigError(
+                "observer=none simulates the plant, and data=csv does not; choose one of them"
+            )
         _refuse_made_up(settings, levels)
         return
+    time = settings.time
     if not levels.silent:
         check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
     if not time.horizon >= max(abs(time.start) * _RESOLVED, 1.0 / LARGEST):

@@ -10,7 +10,7 @@ import numpy as np
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.doubts import WORSE
-from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, SimulationResult
+from gpebo_cli.experiment.result import ActiveBound, Fit, SignalsResult, SimulationResult
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
@@ -57,10 +57,8 @@ def verdict(
             near = "below 1 %" if reached else "all within ±2σ of the end"
             reached = f", {near} after {seconds:.4g} s"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end{reached}")
-    elif fit is not None:
-        best = fit.best
     else:
-        best = 0
+        best = 0 if fit is None else fit.best
     if fit is not None:
         parts.append(
             f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
@@ -183,14 +181,12 @@ def pauses_note(rows: Rows) -> str:
     )
 
 
-def functions_note(
-    system: DescriptorSystem, simulated: SimulationResult | RecordingResult | None
-) -> str:
+def functions_note(system: DescriptorSystem, signals: SignalsResult) -> str:
     """What the last line of a run has to say of functions without bounds, from "; " on."""
     source = system.coefficients
     if isinstance(source, FunctionCoefficients) and source.functions:
         which = f"functions from Python ({', '.join(source.functions)})"
-    elif simulated is not None and not simulated.bounded:
+    elif not signals.bounded:
         which = "functions that change so often"
     else:
         return ""

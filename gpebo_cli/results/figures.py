@@ -20,7 +20,7 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.comparison import norm_panels
-from gpebo_cli.results.finished import ErrorCurves, largest
+from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
@@ -360,11 +360,7 @@ def _by_unit(
 def truth_at(result: RunResult, t: Array) -> Array:
     """True states (M, n) at the times t (M,) of the estimates, which are some of the output's."""
     signals = result.signals
-    if len(t) == len(signals.t):
-        return signals.states
-    # The middle between two neighbours: rounding of a time does not choose another row.
-    nearest = np.searchsorted(0.5 * (signals.t[1:] + signals.t[:-1]), t)
-    return np.asarray(signals.states[nearest])
+    return np.asarray(signals.states[rows_at(signals.t, t)])
 
 
 def _known(result: RunResult) -> list[int]:
