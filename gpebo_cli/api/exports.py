@@ -40,8 +40,10 @@ def to_control(result: RunResult) -> Any:
     control = _package("control")
     system, settings = result.system, result.settings
     observer = observers.build(settings.observer)
-    plain = isinstance(observer, Gpebo) and isinstance(observer.remedy, Plain)
-    if not isinstance(observer, Gpebo) or not plain or observer.sample_time is not None:
+    if not (
+        isinstance(observer, Gpebo) and isinstance(observer.remedy, Plain)
+        and observer.sample_time is None
+    ):
         raise ConfigError(
             "to_control takes observer=gpebo in continuous time without a remedy, and this run has "
             f"observer={settings.observer.get('name')}, sample_time "

@@ -179,17 +179,13 @@ class Result:
 
     def __getitem__(self, name: str) -> Array:
         """A signal by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
-        if name == "t":
-            return self.t
-        everything: dict[str, NamedArrays] = {}
-        for signals in (self.inputs, self.outputs, self.states):
-            everything |= dict.fromkeys(signals, signals)
+        everything = {"t": self.t, **self.inputs, **self.outputs, **self.states}
         if name in everything:
-            return everything[name][name]
+            return everything[name]
         hats = [estimate + _HAT for estimate in self.estimates]
         if name in hats:
             return self.estimates[name.removesuffix(_HAT)]
-        known = ["t", *everything, *hats]
+        known = [*everything, *hats]
         raise UnknownNameError(str(unknown(f"this run has no signal {shown(name)}", name, known)))
 
     def __str__(self) -> str:

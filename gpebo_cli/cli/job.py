@@ -78,8 +78,8 @@ def remove_if_empty(folder: str) -> None:
 
 def described_in(chosen: Mapping[str, Any], arguments: Arguments) -> str:
     """Where the plant or regression that was chosen, or the primary configuration, was written."""
-    names = {group: chosen.get(group) for group in ("regression", "plant")}
-    inside = next((f"{g}/{name}" for g, name in names.items() if name), arguments.config_name)
+    files = (f"{group}/{chosen[group]}" for group in ("regression", "plant") if chosen.get(group))
+    inside = next(files, arguments.config_name)
     for folder in arguments.folders:
         path = os.path.join(folder, f"{inside}.yaml")
         if os.path.isfile(path):

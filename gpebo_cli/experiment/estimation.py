@@ -278,7 +278,7 @@ def at_samples(
         states = made.states * accuracy.told(made.seen[-1])
         sizes = accuracy.sizes_of(truth, online.natural_sizes, x)
         metrics = accuracy.metrics_of(accuracy.numbers_of(
-            t, parameters - truth, states - x, sizes, accuracy.judged_of(source, truth.shape[1])
+            t, parameters - truth, states - x, sizes, accuracy.judged_of(system, truth.shape[1])
         ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
@@ -372,7 +372,7 @@ def _estimate(
     natural = accuracy.natural_sizes(regression, p)
     sizes = accuracy.sizes_of(truth, natural, x)
     evaluate = accuracy.evaluation(
-        state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(source, p), chosen,
+        state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(system, p), chosen,
         each=each, alone=size == 1,
     )
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))

@@ -60,12 +60,6 @@ class NoiseLevels:
 
 def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLevels:
     """The levels by output and input of a plant, checked (ConfigError)."""
-    if not (np.isfinite(settings.sample_time) and settings.sample_time > 0):
-        raise ConfigError(
-            f"noise.sample_time: expected a positive number of seconds, got {settings.sample_time}"
-        )
-    if settings.seed < 0:
-        raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
     outputs, inputs = system.outputs, system.inputs
     levels = NoiseLevels(
         per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),

@@ -97,18 +97,17 @@ def run_experiment(
     stage = partial(_timed, seconds, progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):
-        read = sources.recorded if recorded else sources.simulated
+        read = sources.recorded if recorded else partial(sources.simulated, levels=levels)
         file = settings.data.file
         each = [settings] if not isinstance(file, list) else [
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
-        source = several.joined_source([read(one, system, levels, samples) for one in each])
+        source = several.joined_source([read(one, system, samples) for one in each])
     of_source = source.assumptions
     result = RunResult(
-        settings=settings, system=system, simulation=source.simulation, regression=None,
-        excitation=None, estimation=None, metrics=None, timings=seconds,
-        assumptions=lambda: tuple(of_source()), verdict=source.verdict,
-        recording=source.recording,
+        settings=settings, system=system, simulation=source.simulation,
+        recording=source.recording, timings=seconds, assumptions=lambda: tuple(of_source()),
+        verdict=source.verdict,
     )
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)

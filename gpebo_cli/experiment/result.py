@@ -162,6 +162,12 @@ class NoiseStatistics:
     rms: Array  # (G, p) root mean square error
 
 
+def place_of_least(values: Array) -> int | None:
+    """Place of the least finite value of (g,), None if there is none."""
+    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
+    return place if np.isfinite(values[place]) else None
+
+
 @dataclass(frozen=True)
 class Fit:
     """How well the final estimates explain all data: what is known without the truth."""
@@ -191,10 +197,10 @@ class Fit:
     @property
     def best(self) -> int:
         """The case with the least residual."""
-        return int(np.argmin(np.where(np.isfinite(self.residual), self.residual, np.inf)))
+        return place_of_least(self.residual) or 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunResult:
     """Everything one run produced; the later stages are None when ``observer=none``.
 
@@ -204,16 +210,16 @@ class RunResult:
 
     settings: Settings
     system: DescriptorSystem
-    simulation: SimulationResult | None
-    regression: RegressionResult | None
-    excitation: Excitation | None
-    estimation: EstimationResult | None
-    metrics: Metrics | None
+    simulation: SimulationResult | None = None
+    recording: RecordingResult | None = None
+    regression: RegressionResult | None = None
+    excitation: Excitation | None = None
+    estimation: EstimationResult | None = None
+    metrics: Metrics | None = None
     timings: Mapping[str, float]  # stage -> seconds
     assumptions: OnDemand[tuple[Assumption, ...]] = OnDemand()
     verdict: OnDemand[str] = OnDemand()  # the last line a person reads
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
-    recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
     # From when on each parameter and state is determined by the data, None: never.
     estimable: OnDemand[Mapping[str, float | None]] = OnDemand(dict)

@@ -49,7 +49,6 @@ class Source:
     outputs: Trajectory  # (r,)
     states: Trajectory  # (n,) the truth, NaN where nobody knows
     theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
-    judged: slice  # parameters that count when estimates are compared with the truth
     assumptions: Callable[[], Sequence[Assumption]]  # of the plant, when they are asked for
     verdict: str = ""  # where nothing is estimated
     derivatives: InputDerivatives | None = None  # of the inputs, as far as they are known
@@ -67,7 +66,7 @@ class Source:
 
 
 def simulated(
-    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
+    settings: Settings, system: DescriptorSystem, samples: Sampling | None, levels: NoiseLevels
 ) -> Source:
     """Signals of the plant, for an observer at ``samples`` or in continuous time (ConfigError)."""
     start = settings.time.start
@@ -92,7 +91,7 @@ def simulated(
         )
     return Source(
         t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
-        theta=system.theta_at, judged=_judged(system),
+        theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
@@ -100,16 +99,14 @@ def simulated(
     )
 
 
-def recorded(
-    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None  # noqa: ARG001  a source like the other
-) -> Source:
+def recorded(settings: Settings, system: DescriptorSystem, samples: Sampling | None) -> Source:
     """Signals of a recording; nobody knows what θ was when it was made."""
     recording = load(system, settings.data, settings.time, settings.solver.tol)
     t, table = _grid(settings, samples, *recording.span), recording.table
     samples_t = table.samples.t
     return Source(
         t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
-        theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
+        theta=lambda at: np.full((len(at), system.q), np.nan),
         assumptions=tuple, derivatives=recording.derivatives,
         rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
@@ -196,11 +193,6 @@ def sample_times(step: float, start: float, stop: float) -> Array:
             "one run"
         )
     return np.asarray(start + step * np.arange(count + 1), dtype=np.float64)
-
-
-def _judged(system: DescriptorSystem) -> slice:
-    """Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts."""
-    return slice(system.q if system.theta_varies else None)
 
 
 def _sample_simulation(

@@ -10,9 +10,15 @@ import numpy as np
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.doubts import WORSE
-from gpebo_cli.experiment.result import ActiveBound, Fit, SignalsResult, SimulationResult
+from gpebo_cli.experiment.result import (
+    ActiveBound,
+    Fit,
+    SignalsResult,
+    SimulationResult,
+    place_of_least,
+)
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.numerics.rows import Rows
 
@@ -200,15 +206,11 @@ def _best_case(metrics: Metrics) -> int | None:
     noise both are chance, and the least error over the whole run counts. None where the error of no
     case is a number.
     """
-    least_error = _least(metrics.final_error_states)
+    least_error = place_of_least(metrics.final_error_states)
     if least_error is None:
         return None
     noisy = metrics.seconds_to_settled is not None
-    first = _least(metrics.rms_error_states if noisy else metrics.seconds_to_1pct_states)
+    first = place_of_least(
+        metrics.rms_error_states if noisy else metrics.seconds_to_1pct_states
+    )
     return least_error if first is None else first
-
-
-def _least(values: Array) -> int | None:
-    """Place of the least finite value of (g,), None if there is none."""
-    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
-    return place if isfinite(values[place]) else None

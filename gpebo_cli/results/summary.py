@@ -154,13 +154,12 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
     estimation = result.estimation
     if estimation is None:
         return {}
-    signals, units = result.signals, result.system.units
-    nothing = np.full(len(result.system.states), np.nan)
-    last = signals.states[-1] if len(signals.states) else nothing
+    units = result.system.units
     kinds = (
         (estimation.names, estimation.parameters, estimation.parameters_std,
          estimation.true_parameters[-1]),
-        (result.system.states, estimation.states, estimation.states_std, last),
+        (result.system.states, estimation.states, estimation.states_std,
+         result.signals.states[-1]),
     )
     out: dict[str, dict[str, Any]] = {}
     for names, values, deviations, truth in kinds:
