@@ -90,4 +90,9 @@ def beside(file: str, source: str, where: str) -> str:
         raise ConfigError(
             f"{where}: {file} lies outside of {folder} and of the current folder; copy it there"
         )
+    return as_seen_from_here(path)
+
+
+def as_seen_from_here(path: str) -> str:
+    """A path, relative to the current folder where that is shorter."""
     return min(path, os.path.relpath(path), key=len)

@@ -16,6 +16,7 @@ from gpebo_cli.cli import composition
 from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.configs import configuration
+from gpebo_cli.reading import as_seen_from_here
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import RunResult
@@ -83,5 +84,5 @@ def described_in(chosen: Mapping[str, Any], arguments: Arguments) -> str:
     for folder in arguments.folders:
         path = os.path.join(folder, f"{inside}.yaml")
         if os.path.isfile(path):
-            return min(path, os.path.relpath(path), key=len)
+            return as_seen_from_here(path)
     return ""
