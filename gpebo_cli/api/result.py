@@ -19,6 +19,7 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.findings import Assumption, replaced
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.matrix import counted
 from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
@@ -197,9 +198,8 @@ class Result:
         first, last = float(self.t[0]), float(self.t[-1])
         what = f"{details.settings.observer.get('name')}, {len(self.t)} times"
         if details.estimation is not None:
-            count = len(details.estimation.cases)
-            name = details.settings.estimator.get("name")
-            what += f", {name} with {count} case{'' if count == 1 else 's'}"
+            cases = counted(len(details.estimation.cases), "case")
+            what += f", {details.settings.estimator.get('name')} with {cases}"
         return f"<gpebo run of {details.system.name}, t = {first:g} to {last:g} s, {what}>"
 
     def _repr_html_(self) -> str:

@@ -20,6 +20,7 @@ from gpebo_cli.experiment.result import (
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
+from gpebo_cli.model.matrix import counted
 from gpebo_cli.numerics.rows import Rows
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
@@ -181,7 +182,7 @@ def pauses_note(rows: Rows) -> str:
         "the last sample is held", "data.hold=linear, or "
     )
     return (
-        f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s {how} "
+        f"; through {counted(len(long), 'pause')} of up to {long.max():.3g} s {how} "
         f"(data.hold={rows.hold}), which biases estimates beyond their deviations if the plant "
         f"moves meanwhile: take {instead}a file for each part (data.file=[…])"
     )

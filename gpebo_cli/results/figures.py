@@ -382,12 +382,11 @@ def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:
 def _varying_gain(estimation: EstimationResult) -> str | None:
     """The gain that alone tells the cases apart, if there are enough of them to draw a curve."""
     distinct = {name: np.unique(values) for name, values in estimation.gains.items()}
-    varying = [name for name, found in distinct.items() if len(found) > 1]
+    varying = [(name, found) for name, found in distinct.items() if len(found) > 1]
     if len(varying) != 1:
         return None
-    found = distinct[varying[0]]
-    usable = len(found) >= MIN_GAINS and bool(np.isfinite(found).all() and found[0] > 0.0)
-    return varying[0] if usable else None
+    ((name, found),) = varying
+    return name if len(found) >= MIN_GAINS and np.isfinite(found).all() and found[0] > 0 else None
 
 
 def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:

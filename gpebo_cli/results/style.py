@@ -342,9 +342,8 @@ def _fill(axes: Axes, panel: Panel, height: float) -> None:
 def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
     """Scale, limits, ticks and name of the horizontal axis."""
     axis = panels[0].axis
-    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves if curve.x.size]
-    values = np.concatenate(ends or [np.ones(1)])
-    low, high = float(values.min()), float(values.max())
+    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves]
+    low, high = float(np.min(ends)), float(np.max(ends))
     if not high > low:
         high = low * 10.0 if axis.log else low + 1.0
     if axis.log:
