@@ -40,7 +40,7 @@ def seen(system, **noise):
     """True and measured signals of a plant."""
     settings = NoiseSettings(**noise)
     signals = simulate(system, TIME, SOLVER).signals
-    return signals, measure(signals, settings, noise_levels(settings, system))
+    return signals, measure(signals, noise_levels(settings, system), settings.seed)
 
 
 def flat_mesh(edges, stages=12):

@@ -26,7 +26,7 @@ from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, 
 from gpebo_cli.experiment.bounds import bounded
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
-from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
+from gpebo_cli.experiment.noise import signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
@@ -58,8 +58,8 @@ Stage = Callable[[str], AbstractContextManager[Pace]]
 
 
 def continuous(
-    result: RunResult, source: Source, levels: NoiseLevels, observer: Observer,
-    estimator: estimators.Estimator, stage: Stage,
+    result: RunResult, source: Source, observer: Observer, estimator: estimators.Estimator,
+    stage: Stage,
 ) -> RunResult:
     """The result with observer and estimator as differential equations (SolverError)."""
     settings, system = result.settings, result.system
@@ -72,7 +72,7 @@ def continuous(
             inside = (known.samples > known.t[0]) & (known.samples < known.t[-1])
             asked = np.union1d(known.t, known.samples[inside])
         seen = Measurements(
-            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
+            signals.inputs, signals.outputs, signal_noise(source.levels, known.rows),
             known.derivatives, known.t if known.recording else None, asked,
             [
                 (each.inputs.mesh.size, each.inputs.mesh.points.size)
@@ -110,21 +110,20 @@ def continuous(
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     why = ""
-    if source.noisy(levels) or observation.estimator is not None:
+    if source.noisy or observation.estimator is not None:
         with stage("uncertainty"):
             estimation, why = _with_deviations(
-                settings, observation, estimator, source, levels, known, estimation
+                settings, observation, estimator, source, known, estimation
             )
     fit = fit_of(observation, estimation, system, source) if source.recording else None
-    if fit is not None and settings.uncertainty and not levels.silent:
-        about = observation.evidence or observation
-        fit = replace(fit, ratio=residual_ratio(about, source, settings.noise, levels))
+    if fit is not None and settings.uncertainty:
+        fit = replace(fit, ratio=residual_ratio(observation.evidence or observation, source))
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds") as pace:
-            theta = source.theta(t[-1:])
             noise = over_seeds(
-                observation, observe, source.true, theta, estimator, settings.noise, levels, pace
+                observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
+                pace,
             )
     unknown = [
         name for name, is_known in told.items() if not (is_known or name in observation.unseen)
@@ -138,14 +137,14 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why), noisy=source.noisy(levels),
+        _gains(observation, estimation), _no_deviations(why),
     )
 
 
 def _completed(
     found: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
     excitation: Excitation, estimation: EstimationResult, metrics: Metrics, gains: Array | None,
-    note: str, *, noisy: bool,
+    note: str,
 ) -> RunResult:
     """What was ``found`` with the rest that observer and estimator made of a source, and its words.
 
@@ -153,7 +152,7 @@ def _completed(
     ``accuracy.standing``, and the ``note`` is for the last line of a run, from "; " on.
     """
     system, simulation, recording = found.system, found.simulation, found.recording
-    if noisy:
+    if source.noisy:
         metrics = accuracy.standing(estimation, metrics, gains, system, found.noise)
     # A result that is kept for what it has to tell must not keep what the observer made.
     of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
@@ -175,7 +174,7 @@ def _completed(
 
 def _with_deviations(
     settings: Settings, observation: Observation, estimator: estimators.Estimator, source: Source,
-    levels: NoiseLevels, known: Knowledge, estimation: EstimationResult,
+    known: Knowledge, estimation: EstimationResult,
 ) -> tuple[EstimationResult, str]:
     """With standard deviations, or why there are none (not, if nobody asked)."""
     if isinstance(observation.state_map, Filtering):
@@ -186,8 +185,8 @@ def _with_deviations(
         return estimation, ""
     some, columns = _about(observation, known.independent)
     found = standard_deviations(
-        replace(observation, regression=some), estimator, source, settings.noise, levels,
-        estimation.t, estimation.states, columns,
+        replace(observation, regression=some), estimator, source, estimation.t, estimation.states,
+        columns,
     )
     if isinstance(found, str):
         return estimation, found
@@ -226,8 +225,8 @@ def _gains(observation: Observation, estimation: EstimationResult) -> Array | No
 
 
 def at_samples(
-    result: RunResult, source: Source, levels: NoiseLevels, samples: Sampling,
-    estimator: estimators.Estimator, stage: Stage,
+    result: RunResult, source: Source, samples: Sampling, estimator: estimators.Estimator,
+    stage: Stage,
 ) -> RunResult:
     """The same at samples of the signals, ``samples.step`` apart (ConfigError)."""
     settings, system = result.settings, result.system
@@ -244,7 +243,7 @@ def at_samples(
             by: estimators.Estimator, columns: IntArray | None, *, last: bool
         ) -> tuple[Online, list[OnlineEstimates]]:
             wanted = (
-                sampled_deviations(settings.noise, levels, source)
+                sampled_deviations(source.levels, source)
                 if settings.uncertainty and last else None
             )
             online = Online(
@@ -304,7 +303,7 @@ def at_samples(
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
-    rows, noisy = made.regression.rows[1 + chosen], source.noisy(levels)
+    rows = made.regression.rows[1 + chosen]
     sampled = RegressionResult(
         t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
     )
@@ -315,7 +314,7 @@ def at_samples(
     return _completed(
         found, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
-        _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy,
+        _no_deviations(why) if source.noisy else _held(samples, metrics),
     )
 
 

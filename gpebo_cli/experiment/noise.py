@@ -43,6 +43,7 @@ _RESOLVED = 1e-10  # of a sample: what a polynomial may miss of the interpolant
 class NoiseLevels:
     """Standard deviations and steps per signal, zeros where there is no noise."""
 
+    settings: NoiseSettings  # which say when it is sampled, too
     outputs: Array  # (r,) σ
     inputs: Array  # (m,) σ
     steps: Array  # (r,) of quantisation
@@ -62,6 +63,7 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     """The levels by output and input of a plant, checked (ConfigError)."""
     outputs, inputs = system.outputs, system.inputs
     levels = NoiseLevels(
+        settings,
         per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),
         per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),
         per_name(settings.quantisation, outputs, "output", "noise.quantisation", absent=0.0),
@@ -74,15 +76,13 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     return levels
 
 
-def signal_noise(
-    settings: NoiseSettings, levels: NoiseLevels, rows: Rows | None = None
-) -> SignalNoise:
+def signal_noise(levels: NoiseLevels, rows: Rows | None = None) -> SignalNoise:
     """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
 
     A recording has ``rows`` of its own.
     """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    step = settings.sample_time if rows is None else float(np.diff(rows.t).mean())
+    step = levels.settings.sample_time if rows is None else float(np.diff(rows.t).mean())
     return SignalNoise(levels.inputs, outputs, step, rows)
 
 
@@ -131,20 +131,20 @@ def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     return SampledMesh(Mesh(edges, mesh.rule), sample, sample_time)
 
 
-def measure(signals: Signals, settings: NoiseSettings, levels: NoiseLevels) -> Signals:
+def measure(signals: Signals, levels: NoiseLevels, seed: int) -> Signals:
     """u + e, y + e and the true states, on a mesh that ends elements at the sample instants.
 
     Without noise these are ``signals`` themselves, to the last bit.
     """
     if levels.silent:
         return signals
-    grid = noise_grid(signals.mesh, settings)
+    grid, shape = noise_grid(signals.mesh, levels.settings), levels.settings.shape
     mesh = grid.mesh
     true = Signals(*map(mesh.along, (signals.inputs, signals.outputs, signals.states)))
-    of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, settings.seed)
+    of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, seed)
     return Signals(
-        Trajectory(mesh, true.inputs.values + between(of_inputs, grid, settings.shape)),
-        Trajectory(mesh, true.outputs.values + between(of_outputs, grid, settings.shape)),
+        Trajectory(mesh, true.inputs.values + between(of_inputs, grid, shape)),
+        Trajectory(mesh, true.outputs.values + between(of_outputs, grid, shape)),
         true.states,
     )
 

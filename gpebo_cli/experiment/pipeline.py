@@ -88,7 +88,7 @@ def run_experiment(
     observer = build(settings.observer)
     if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
-    check_seeds(settings.noise, levels, settings.time.horizon)
+    check_seeds(levels, settings.time.horizon)
     limits.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     if isinstance(estimator, estimators.Fitting):
         given = system.regression
@@ -97,12 +97,12 @@ def run_experiment(
     stage = partial(_timed, seconds, progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
     with stage("read" if recorded else "simulate"):
-        read = sources.recorded if recorded else partial(sources.simulated, levels=levels)
+        read = sources.recorded if recorded else sources.simulated
         file = settings.data.file
         each = [settings] if not isinstance(file, list) else [
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
-        source = several.joined_source([read(one, system, samples) for one in each])
+        source = several.joined_source([read(one, system, levels, samples) for one in each])
     of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation,
@@ -113,8 +113,8 @@ def run_experiment(
         refuse_seeds(settings.noise)
         return result
     if samples is None:
-        return continuous(result, source, levels, observer, estimator, stage)
-    return at_samples(result, source, levels, samples, estimator, stage)
+        return continuous(result, source, observer, estimator, stage)
+    return at_samples(result, source, samples, estimator, stage)
 
 
 def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Array], Online]:
@@ -131,8 +131,7 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
         )
     deviations = None
     if settings.uncertainty:
-        levels = noise_levels(settings.noise, system)
-        deviations = sampled_deviations(settings.noise, levels, None)
+        deviations = sampled_deviations(noise_levels(settings.noise, system), None)
     return lambda start, sample: Online(
         settings, system, holds(settings.data.hold, system), start, sample, estimator, deviations
     )

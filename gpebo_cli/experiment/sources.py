@@ -45,6 +45,7 @@ class Source:
     """What the observer gets to see, and what is known about it."""
 
     t: Array  # (N,) the output grid
+    levels: NoiseLevels  # of the noise, of a recording as far as they are given
     inputs: Trajectory  # (m,)
     outputs: Trajectory  # (r,)
     states: Trajectory  # (n,) the truth, NaN where nobody knows
@@ -60,19 +61,20 @@ class Source:
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
-    def noisy(self, levels: NoiseLevels) -> bool:
+    @property
+    def noisy(self) -> bool:
         """Whether there are errors in what the observer gets to see."""
-        return self.recording is not None or not levels.silent
+        return self.recording is not None or not self.levels.silent
 
 
 def simulated(
-    settings: Settings, system: DescriptorSystem, samples: Sampling | None, levels: NoiseLevels
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
 ) -> Source:
     """Signals of the plant, for an observer at ``samples`` or in continuous time (ConfigError)."""
     start = settings.time.start
     t = _grid(settings, samples, start, start + settings.time.horizon)
     simulation = simulation_of(system, settings.time, settings.solver)
-    measured = measure(simulation.signals, settings.noise, levels)
+    measured = measure(simulation.signals, levels, settings.noise.seed)
     simulated = _sample_simulation(system, simulation, t)
     if not levels.silent:
         # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
@@ -90,8 +92,8 @@ def simulated(
             "observer=none to simulate only"
         )
     return Source(
-        t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
-        theta=system.theta_at,
+        t=t, levels=levels, inputs=measured.inputs, outputs=measured.outputs,
+        states=simulation.signals.states, theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
@@ -99,14 +101,16 @@ def simulated(
     )
 
 
-def recorded(settings: Settings, system: DescriptorSystem, samples: Sampling | None) -> Source:
+def recorded(
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
+) -> Source:
     """Signals of a recording; nobody knows what θ was when it was made."""
     recording = load(system, settings.data, settings.time, settings.solver.tol)
     t, table = _grid(settings, samples, *recording.span), recording.table
     samples_t = table.samples.t
     return Source(
-        t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
-        theta=lambda at: np.full((len(at), system.q), np.nan),
+        t=t, levels=levels, inputs=recording.inputs, outputs=recording.outputs,
+        states=recording.states, theta=lambda at: np.full((len(at), system.q), np.nan),
         assumptions=tuple, derivatives=recording.derivatives,
         rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
