@@ -23,7 +23,7 @@ from gpebo_cli.results.comparison import norm_panels
 from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
-from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
+from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset, unit_of
 from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def fit(result: RunResult) -> list[Panel]:
     s, labels = result.signals, result.system.labels
     panels = []
     for i, name in enumerate(result.system.outputs):
-        unit, text = _unit(result, name), typeset(name, labels)
+        unit, text = unit_of(name, result.system.units), typeset(name, labels)
         measured, fitted = s.outputs[:, i], found.outputs[:, i]
         curves = (
             Curve(s.t, measured, f"{name} measured", style.MEASURED, f"{text} measured"),
@@ -324,15 +324,12 @@ def _of_states(
     return _of_estimates(of_part)
 
 
-def _unit(result: RunResult, name: str) -> str:
-    units = result.system.units
-    return units.get(name) or units.get(name.removeprefix(_INITIAL), "")
-
-
 def _panel(result: RunResult, name: str, curves: tuple[Curve, ...], **more: Any) -> Panel:
     """The panel of one quantity, called as the plant's author calls it."""
-    text = typeset(name, result.system.labels)
-    return Panel(name, curves, _unit(result, name), text, **more)
+    system = result.system
+    return Panel(
+        name, curves, unit_of(name, system.units), typeset(name, system.labels), **more
+    )
 
 
 def _by_unit(
@@ -539,9 +536,9 @@ def _error(
         up, down = 2 * deviation, -2 * deviation if signed else None
         label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")
         curves = (*curves, Curve(estimation.t, up, label, style.SPREAD, text, down_to=down))
-    labels = result.system.labels
-    return Panel(f"error of {name}", curves, _unit(result, name),
-                 error_of(name, labels, signed=signed), log=not signed, size=size)
+    system = result.system
+    return Panel(f"error of {name}", curves, unit_of(name, system.units),
+                 error_of(name, system.labels, signed=signed), log=not signed, size=size)
 
 
 # In the paper x_a and x_b are Figs. 4 and 5, their errors Figs. 7 and 8.

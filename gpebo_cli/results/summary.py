@@ -20,6 +20,7 @@ from gpebo_cli.experiment.result import (
 )
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.results.provenance import Provenance
+from gpebo_cli.results.symbols import unit_of
 from gpebo_cli.schema import plain
 
 MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
@@ -167,7 +168,7 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
             out.setdefault(name, {
                 "value": values[case, -1, i],
                 "std": None if deviations is None else deviations[case, -1, i],
-                "unit": units.get(name.removeprefix("e0_")),
+                "unit": unit_of(name, units) or None,
                 "true": truth[i],
             })
     return out
