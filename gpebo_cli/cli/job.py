@@ -50,7 +50,7 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     return Job(settings, system, configuration.complete(config, settings))
 
 
-def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -> RunResult:
+def run_job(job: Job, folder: str, *, quiet: bool, loud: bool) -> RunResult:
     """Run the experiment of ``job`` and write ``folder``."""
     # Only now, when the configuration is known to be good: half a second of imports.
     from gpebo_cli.experiment.pipeline import run_experiment

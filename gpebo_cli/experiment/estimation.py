@@ -242,12 +242,10 @@ def at_samples(
         def fed(
             by: estimators.Estimator, columns: IntArray | None, *, last: bool
         ) -> tuple[Online, list[OnlineEstimates]]:
-            wanted = (
-                sampled_deviations(source.levels, source)
-                if settings.uncertainty and last else None
-            )
+            wanted = settings.uncertainty and last
             online = Online(
-                settings, system, samples.hold, start, np.append(u[0], y[0]), by, wanted,
+                settings, system, samples.hold, start, np.append(u[0], y[0]), by,
+                sampled_deviations(source.levels, source) if wanted else None,
                 source.derivatives, columns,
             )
             made = []

@@ -93,7 +93,7 @@ def _variances(levels: NoiseLevels) -> Array:
 
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, t: Array, states: Array,
-    columns: IntArray,
+    columns: IntArray | slice = slice(None),
 ) -> tuple[Array, Array] | str:
     """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
 

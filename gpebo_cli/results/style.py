@@ -364,7 +364,7 @@ def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
 def _ends(panel: Panel, low: float, high: float) -> tuple[float, float]:
     """The smallest and the largest value that is drawn; ``low`` and ``high`` if nothing is."""
     bands = [] if panel.log else [c.down_to for c in panel.curves if c.down_to is not None]
-    values = np.concatenate([*(drawn(panel, c) for c in panel.curves), *bands, [np.nan]])
+    values = np.concatenate([*(drawn(panel, c) for c in panel.curves), *bands])
     values = values[np.isfinite(values)]
     return (float(values.min()), float(values.max())) if values.size else (low, high)
 
