@@ -36,7 +36,6 @@ def joined_source(sources: Sequence[Source]) -> Source:
 
     t = together([source.t for source in sources], shifts)
     rows = [source.rows for source in sources if source.rows is not None]
-    known = [set(each.known_states) for each in recordings]
     recording = replace(
         recordings[0], t=t,
         inputs=together([each.inputs for each in recordings]),
@@ -46,7 +45,8 @@ def joined_source(sources: Sequence[Source]) -> Source:
         sha256=", ".join(each.sha256 for each in recordings),
         rows=sum(each.rows for each in recordings), last=recordings[-1].last + shifts[-1],
         known_states=tuple(
-            name for name in recordings[0].known_states if all(name in each for each in known)
+            name for name in recordings[0].known_states
+            if all(name in each.known_states for each in recordings)
         ),
         elements=sum(each.elements for each in recordings),
         bounded=all(each.bounded for each in recordings),
