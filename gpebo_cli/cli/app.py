@@ -103,7 +103,7 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 def _dispatch(words: list[str]) -> int:
     command, rest = (words[0], words[1:]) if words else ("--help", [])
-    if command in ("--version", "-V", "version"):
+    if command in ("--version", "-V", "version") or (command == "run" and "--version" in rest):
         from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
