@@ -137,16 +137,7 @@ def check(
 ) -> tuple[Assumption, ...]:
     """Every assumption that a run would rest on, with its evidence, as ``gpebo check`` has them.
 
-    Args:
-        plant: as in :func:`run`; the other arguments, too.
-        regression: in place of a plant and an observer.
-        observer: a name or a mapping.
-        solver: a name or a mapping.
-        noise: a name or a mapping.
-        data: a recording, as in :func:`run`.
-        time: ``start`` and ``horizon`` in seconds.
-        excitation: ``rho`` and ``window`` (seconds).
-        config_dir: a folder of yours.
+    The arguments are those of :func:`run`, with the same meaning.
 
     Raises:
         ConfigError: a wrong name, key, value or plant.

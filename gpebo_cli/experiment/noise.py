@@ -105,17 +105,6 @@ class SampledMesh:
         return int(self.sample[-1]) + 1
 
 
-def check_samples(horizon: float, sample_time: float, max_elements: int) -> None:
-    """Refuse more samples than elements are allowed (ConfigError: names both numbers)."""
-    samples = horizon / sample_time
-    if samples > max_elements:
-        raise ConfigError(
-            f"noise.sample_time = {sample_time:g} s makes {samples:.6g} samples over "
-            f"{horizon:g} s, and each needs an element; solver.max_elements is {max_elements}. "
-            "Raise one of them"
-        )
-
-
 def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     """``mesh`` with every sample instant an edge; its own edges stay.
 

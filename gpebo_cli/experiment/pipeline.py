@@ -122,16 +122,15 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
 
     ConfigError: a setting that needs to know how a recording goes on.
     """
-    sources.check_stream(settings, system)
+    levels = noise_levels(settings.noise, system)
+    sources.check_stream(settings, system, levels)
     estimator = estimators.build(settings.estimator)
     if len(estimator.cases) > 1:
         raise ConfigError(
             f"the gains of the estimator make {len(estimator.cases)} cases; a stream has room for "
             "one"
         )
-    deviations = None
-    if settings.uncertainty:
-        deviations = sampled_deviations(noise_levels(settings.noise, system), None)
+    deviations = sampled_deviations(levels, None) if settings.uncertainty else None
     return lambda start, sample: Online(
         settings, system, holds(settings.data.hold, system), start, sample, estimator, deviations
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import of_simulation
-from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure, noise_levels
+from gpebo_cli.experiment.noise import NoiseLevels, measure
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
 from gpebo_cli.experiment.verdict import (
     functions_note,
@@ -135,11 +135,15 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
             raise ConfigError(
                 "observer=none simulates the plant, and data=csv does not; choose one of them"
             )
-        _refuse_made_up(settings, levels)
+        _refuse_made_up(levels)
         return
-    time = settings.time
-    if not levels.silent:
-        check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
+    time, step, most = settings.time, settings.noise.sample_time, settings.solver.max_elements
+    if not levels.silent and time.horizon / step > most:
+        raise ConfigError(
+            f"noise.sample_time = {step:g} s makes {time.horizon / step:.6g} samples over "
+            f"{time.horizon:g} s, and each needs an element; solver.max_elements is {most}. "
+            "Raise one of them"
+        )
     if not time.horizon >= max(abs(time.start) * _RESOLVED, 1.0 / LARGEST):
         raise ConfigError(
             f"time.horizon = {time.horizon:g} s is too short to be resolved beside time.start = "
@@ -147,20 +151,20 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         )
 
 
-def _refuse_made_up(settings: Settings, levels: NoiseLevels) -> None:
-    if settings.noise.seeds > 1 or levels.steps.any():
+def _refuse_made_up(levels: NoiseLevels) -> None:
+    if levels.settings.seeds > 1 or levels.steps.any():
         raise ConfigError(
             "noise.seeds and noise.quantisation are for simulations; what is recorded or streamed "
             "has its own noise, of which noise.outputs and noise.inputs say how large it is"
         )
 
 
-def check_stream(settings: Settings, system: DescriptorSystem) -> None:
+def check_stream(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> None:
     """Refuse what would need later rows of a recording, whose rows come one after the other.
 
     ConfigError: names the key and what it may be.
     """
-    _refuse_made_up(settings, noise_levels(settings.noise, system))
+    _refuse_made_up(levels)
     if "cubic" in each_of(holds(settings.data.hold, system), 1):
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
