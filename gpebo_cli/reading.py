@@ -78,16 +78,20 @@ def beside(file: str, source: str, where: str) -> str:
     """
     if not source:
         return file
-    folder = os.path.dirname(os.path.abspath(source))
-    if os.path.basename(folder) in ("plant", "regression"):
-        folder = os.path.dirname(folder)
-    folders = [os.path.dirname(os.path.abspath(source)), folder, os.getcwd()]
+    own = os.path.dirname(os.path.abspath(source))
+    group = os.path.basename(own) in ("plant", "regression")
+    folder = os.path.dirname(own) if group else own
+    folders = [own, folder, os.getcwd()]
     paths = [os.path.normpath(os.path.join(place, file)) for place in folders]
     path = next((found for found in paths if os.path.exists(found)), paths[-1])
-    real = os.path.realpath(path)
-    if not any(os.path.commonpath([real, os.path.realpath(place)]) == os.path.realpath(place)
-               for place in folders):
+    real, homes = os.path.realpath(path), map(os.path.realpath, folders)
+    if not any(os.path.commonpath([real, home]) == home for home in homes):
         raise ConfigError(
             f"{where}: {file} lies outside of {folder} and of the current folder; copy it there"
         )
+    return as_seen_from_here(path)
+
+
+def as_seen_from_here(path: str) -> str:
+    """A path, relative to the current folder where that is shorter."""
     return min(path, os.path.relpath(path), key=len)

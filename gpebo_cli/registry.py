@@ -7,7 +7,6 @@ from dataclasses import dataclass, is_dataclass
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, TypeVar, cast
 
@@ -22,7 +21,7 @@ _DESCRIPTIVE = ("name", "title", "reference")
 
 def installed(noun: str, name: str) -> str:
     """What to say of an estimator or observer that a package brings and no file describes."""
-    if name not in {entry.name for entry in entry_points(group=f"gpebo.{noun}s")}:
+    if name not in Registry[object](noun).theirs:
         return ""
     return (
         f"; {noun} {name} is installed, and {noun}/{name}.yaml is missing: a file with "
@@ -44,12 +43,8 @@ class Registry(Generic[T]):
     @cached_property
     def ours(self) -> frozenset[str]:
         """Names of the modules here."""
-        spec = find_spec(f"gpebo_cli.{self.noun}s")
-        folders = spec.submodule_search_locations if spec else None
-        return frozenset(
-            path.stem for folder in folders or () for path in Path(folder).glob("*.py")
-            if path.stem[0] != "_"
-        )
+        modules = Path(__file__).with_name(f"{self.noun}s").glob("*.py")
+        return frozenset(path.stem for path in modules if path.stem[0] != "_")
 
     @property
     def group(self) -> str:
@@ -57,13 +52,13 @@ class Registry(Generic[T]):
         return f"gpebo.{self.noun}s"
 
     @property
-    def _theirs(self) -> dict[str, EntryPoint]:
+    def theirs(self) -> dict[str, EntryPoint]:
         """Those that installed packages bring. A name of ours is ours."""
         return {entry.name: entry for entry in entry_points(group=self.group)}
 
     def names(self) -> list[str]:
         """All there are, those of other packages included."""
-        return sorted({*self.ours, *self._theirs})
+        return sorted({*self.ours, *self.theirs})
 
     def build(self, settings: Mapping[str, object]) -> T:
         """The one that ``settings["name"]`` asks for, with the remaining keys as its settings."""
@@ -90,7 +85,7 @@ class Registry(Generic[T]):
         if name in self.ours:
             module = import_module(f"gpebo_cli.{self.noun}s.{name}")
             return cast("type", getattr(module, self.noun.upper()))
-        if name in (theirs := self._theirs):
+        if name in (theirs := self.theirs):
             return self._load(theirs[str(name)])
         article = "an" if self.noun[0] in "aeiou" else "a"
         raise ConfigError(

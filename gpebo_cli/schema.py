@@ -16,6 +16,7 @@ import os
 import types
 import typing
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin
@@ -223,12 +224,8 @@ def _alternative(value: object, kind: Any, alternatives: Sequence[Any], where: s
     if value is None and type(None) in alternatives:
         return None
     for alternative in alternatives:
-        if alternative is type(None):
-            continue
-        try:
+        with suppress(ConfigError):  # the message below names all alternatives
             return convert(value, alternative, where)
-        except ConfigError:
-            continue  # the message below names all alternatives
     raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
 
 

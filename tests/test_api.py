@@ -256,6 +256,8 @@ def test_a_folder_of_ones_own(tmp_path):
     (tmp_path / "estimator").mkdir()
     (tmp_path / "estimator" / "fast.yaml").write_text("name: drem\ngamma: 1e12\n")
     assert "mine" in available("plant", tmp_path)
+    with pytest.raises(ConfigError, match="there is no such folder"):
+        available("plant", tmp_path / "missing")
     result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")

@@ -216,6 +216,7 @@ WRONG = [
     (["run", "horizon=3"], "did you mean time.horizon?"),
     (["run", "plant=plant/mine.yaml"], "write --config-dir . plant=mine"),
     (["check", "--jsn"], "see gpebo check --help; did you mean --json?"),
+    (["check", "--version"], "gpebo check: '--version' is no option"),
     (["list", "--confg-dir", "."], "did you mean --config-dir?"),
     (["figures", "paper_circit"], "did you mean paper_circuit?"),
     (["compare", "--srot", "x"], "did you mean --sort?"),

@@ -488,6 +488,7 @@ def test_to_xarray():
     assert estimates["b_hat"].dims == ("case", "t")
     np.testing.assert_array_equal(estimates["b_hat"].to_numpy()[0], table["b_hat"])
     assert result.to_xarray()["b"].attrs == {"units": "V"}
+    assert estimates["e0_b_hat"].attrs == {"units": "V"}  # an initial error has its state's
 
 
 @pytest.mark.parametrize("package", ["control", "xarray"])

@@ -79,7 +79,7 @@ def test_unknowns_in_a_noisy_output_are_linearised_with_it():
     system = plant(2.0, 0.5, 0.3)
     signals = simulate(system, TimeSettings(horizon=4.0), SolverSettings()).signals
     settings = NoiseSettings("gaussian", 0.02, 0.02)
-    noisy = measure(signals, settings, noise_levels(settings, system))
+    noisy = measure(signals, noise_levels(settings, system), settings.seed)
     observation = observe(
         system, Measurements(noisy.inputs, noisy.outputs), remedy="noise_free"
     )

@@ -258,7 +258,7 @@ def test_levels_follow_names():
     system = two_outputs()
     noise = NoiseSettings(outputs={"y2": 0.3}, sample_time=0.5)
     signals = simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals
-    measured = measure(signals, noise, noise_levels(noise, system))
+    measured = measure(signals, noise_levels(noise, system), noise.seed)
     t = np.linspace(0.0, 1.9, 20)
     difference = measured.outputs(t) - signals.outputs(t)
     assert np.abs(difference[:, 0]).max() < 1e-14

@@ -18,6 +18,7 @@ from processes import assert_refused, refused
 from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.results import document
 from gpebo_cli.results.report import estimate_table
 
 FAST = ("time.samples=51", "time.horizon=8")
@@ -103,6 +104,14 @@ def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
     assert len(files) == 2
 
 
+def test_a_picture_that_is_none_or_too_large_is_left_out(inside, tmp_path, monkeypatch):
+    shutil.copytree("circuit", tmp_path / "run")
+    (tmp_path / "run" / "figures" / "gram.png").write_text("no picture")
+    assert len(page_of(str(tmp_path / "run"))[0].sources) == 1
+    monkeypatch.setattr(document, "_LARGEST", 10)
+    assert not page_of(str(tmp_path / "run"))[0].sources
+
+
 def test_the_page_needs_nothing_else(inside):
     page, text = page_of("circuit", "sweep", "recorded")
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
@@ -116,6 +125,7 @@ def test_a_recording_and_a_sweep_are_told(inside):
     assert "e0_il (A)" in words
     assert "truth" not in words  # nobody knows it, nor when the error was small
     assert "never" not in words
+    assert " α " in words  # with one case its gains are told, though nothing differs
     page, _ = page_of("sweep")
     words = " ".join(page.text)
     assert "3 of 3 jobs are done" in words

@@ -23,7 +23,9 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.report import run_lines
+from gpebo_cli.results.summary import summary
 from gpebo_cli.settings import DataSettings, NoiseSettings, Settings, TimeSettings
 
 sys.path.insert(0, str(ROOT / "docs"))
@@ -419,6 +421,9 @@ def test_the_residual_is_compared_with_the_noise_that_is_given(tmp_path):
     assert "explain the data up to white noise" in told[0][1]
     assert "noisier sensor" in told[1][1]
     assert "is not white" in told[2][1] or told[2][0] > 1.2
+    written = summary(result.details, Provenance({}, None))["fit"]
+    least = result.details.fit.residual.min()
+    assert (written["noise_ratio"], written["least_rms_residual"]) == (told[2][0], least)
     silent = run("descriptor", time={"samples": 401}).to_pandas("signals").reset_index()
     found = run("descriptor", data=silent, noise={**noise, "outputs": 0.1})
     assert "the residual is far below the noise" in found.verdict  # though it is not white

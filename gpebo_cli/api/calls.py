@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, cast, overload
 import numpy as np
 
 from gpebo_cli import observers
-from gpebo_cli.api.choice import choose, primary
+from gpebo_cli.api.choice import choose, folders
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
-from gpebo_cli.configs.files import is_file
-from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, choices, conf_folder
+from gpebo_cli.configs.files import is_file, shipped
+from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import Estimator, settings_of
 from gpebo_cli.experiment import assumptions
@@ -137,16 +137,7 @@ def check(
 ) -> tuple[Assumption, ...]:
     """Every assumption that a run would rest on, with its evidence, as ``gpebo check`` has them.
 
-    Args:
-        plant: as in :func:`run`; the other arguments, too.
-        regression: in place of a plant and an observer.
-        observer: a name or a mapping.
-        solver: a name or a mapping.
-        noise: a name or a mapping.
-        data: a recording, as in :func:`run`.
-        time: ``start`` and ``horizon`` in seconds.
-        excitation: ``rho`` and ``window`` (seconds).
-        config_dir: a folder of yours.
+    The arguments are those of :func:`run`, with the same meaning.
 
     Raises:
         ConfigError: a wrong name, key, value or plant.
@@ -208,7 +199,7 @@ def available(
         config_dir: a folder of yours, with ``GROUP/NAME.yaml``.
 
     Raises:
-        ConfigError: there is no such group.
+        ConfigError: there is no such group, or no such folder.
 
     Examples:
         >>> from gpebo_cli import available
@@ -223,8 +214,9 @@ def available(
         return {name: available(name, config_dir) for name in GROUPS}
     if group not in GROUPS:
         raise unknown(f"available({shown(group)}): no such group", group, GROUPS)
-    folders = [conf_folder(), *([] if config_dir is None else [os.fspath(config_dir)])]
-    return sorted({name for folder in folders for name in choices(folder, group, inside=True)})
+    return sorted({
+        name for folder in folders(config_dir) for name in choices(folder, group, inside=True)
+    })
 
 
 def _configure(
@@ -234,7 +226,7 @@ def _configure(
     """The configuration as ``config.yaml`` has it, the plant, and the settings."""
     if regression is not None:
         plant, sections["observer"] = _in_place(regression, plant, sections["observer"], config_dir)
-    config = {k: v for k, v in primary().items() if k not in ("defaults", "hydra")}
+    config = {k: v for k, v in shipped(PRIMARY).items() if k not in ("defaults", "hydra")}
     for name, example in _SECTIONS.items():
         given = sections[name]
         if given is not None and not isinstance(given, Mapping):
@@ -294,8 +286,7 @@ def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -
     words = (*_CHOSEN, *_SECTIONS, "config_dir", "progress")
     for key in [key for key in gains if key not in known]:
         sections = {
-            "time": tuple(primary()["time"]),
-            "excitation": tuple(primary()["excitation"]),
+            **{name: tuple(shipped(PRIMARY)[name]) for name in _SECTIONS},
             "solver": tuple(field.name for field in fields(SolverSettings)),
             "observer": tuple(observers.settings_of({"name": "gpebo"})),
             "noise": tuple(field.name for field in fields(NoiseSettings)),

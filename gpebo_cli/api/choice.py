@@ -12,8 +12,9 @@ from functools import cache
 from typing import Any
 
 from gpebo_cli.configs import files, locations
-from gpebo_cli.configs.locations import PRIMARY, choices, conf_folder
+from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.reading import as_seen_from_here
 from gpebo_cli.registry import installed
 from gpebo_cli.schema import nearest, plain, shown
 
@@ -21,11 +22,6 @@ _WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
 
 
 default = cache(locations.default)  # a run asks for every group
-
-
-def primary() -> dict[str, Any]:
-    """The primary configuration, ``conf/gpebo.yaml``."""
-    return files.shipped(PRIMARY)
 
 
 def choose(
@@ -49,7 +45,7 @@ def choose(
         path = os.path.expanduser(path)
         if not os.path.exists(path):
             raise ConfigError(f"{path}: there is no such file")
-        return files.load_path(path, group), _shortest(path)
+        return files.load_path(path, group), as_seen_from_here(path)
     if not isinstance(given, str):
         wanted = "a name, a path, a mapping or a DescriptorSystem" if group in _WHOLE else (
             "a name or a mapping"
@@ -69,18 +65,12 @@ def _as_path(given: object) -> str | None:
 def _named(
     group: str, name: str, config_dir: str | os.PathLike[str] | None
 ) -> tuple[dict[str, Any], str]:
-    folders = [conf_folder()]
-    if config_dir is not None:
-        mine = os.path.abspath(os.path.expanduser(os.fspath(config_dir)))
-        if not os.path.isdir(mine):
-            raise ConfigError(f"config_dir {config_dir}: there is no such folder")
-        folders.insert(0, mine)  # first, so that a file with a name of ours is noticed
-    inside = f"{group}/{name}"
-    for folder in folders:
+    inside, home = f"{group}/{name}", folders(config_dir)
+    for folder in home:
         if files.is_file(folder, inside):
             path = os.path.join(folder, f"{inside}.yaml")
-            return files.load(folder, inside), _shortest(path)
-    names = sorted(known for folder in folders for known in choices(folder, group))
+            return files.load(folder, inside), as_seen_from_here(path)
+    names = sorted(known for folder in home for known in choices(folder, group))
     text = f"{group}={name}: there is no such {group}; known: {', '.join(names)}"
     hint = installed(group, name) or nearest(name, names)
     if not hint and config_dir is None:
@@ -88,5 +78,15 @@ def _named(
     raise ConfigError(text + hint)
 
 
-def _shortest(path: str) -> str:
-    return min(path, os.path.relpath(path), key=len)
+def folders(config_dir: str | os.PathLike[str] | None) -> list[str]:
+    """Where files are looked for: ours and, if there is one, a folder of the caller's.
+
+    That one comes first, so that a file in it with a name of ours is noticed (ConfigError: there
+    is no such folder).
+    """
+    if config_dir is None:
+        return [conf_folder()]
+    own = os.path.abspath(os.path.expanduser(os.fspath(config_dir)))
+    if not os.path.isdir(own):
+        raise ConfigError(f"config_dir {config_dir}: there is no such folder")
+    return [own, conf_folder()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from typing import Any
 
@@ -11,6 +12,7 @@ from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.observers.reduced.invariant import invariant_observer
 from gpebo_cli.observers.remedies.plain import Plain
+from gpebo_cli.results.symbols import unit_of
 from gpebo_cli.results.tables import frame
 
 
@@ -23,9 +25,9 @@ def to_xarray(result: RunResult, table: str) -> Any:
     _package("xarray")
     found = frame(result, table).to_xarray()
     units = result.system.units
-    for name in found.variables:
-        unit = "s" if name == "t" else units.get(str(name).removesuffix("_hat"))
-        if unit:
+    for name in map(str, found.variables):
+        quantity = name if name in units else re.sub("_(hat|std|true|measured)$", "", name)
+        if unit := "s" if name == "t" else unit_of(quantity, units):
             found[name].attrs["units"] = unit
     return found.assign_attrs(title=result.system.title, verdict=result.verdict)
 
@@ -40,8 +42,10 @@ def to_control(result: RunResult) -> Any:
     control = _package("control")
     system, settings = result.system, result.settings
     observer = observers.build(settings.observer)
-    plain = isinstance(observer, Gpebo) and isinstance(observer.remedy, Plain)
-    if not isinstance(observer, Gpebo) or not plain or observer.sample_time is not None:
+    if not (
+        isinstance(observer, Gpebo) and isinstance(observer.remedy, Plain)
+        and observer.sample_time is None
+    ):
         raise ConfigError(
             "to_control takes observer=gpebo in continuous time without a remedy, and this run has "
             f"observer={settings.observer.get('name')}, sample_time "

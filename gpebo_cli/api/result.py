@@ -19,6 +19,7 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.findings import Assumption, replaced
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.matrix import counted
 from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
@@ -179,17 +180,13 @@ class Result:
 
     def __getitem__(self, name: str) -> Array:
         """A signal by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
-        if name == "t":
-            return self.t
-        everything: dict[str, NamedArrays] = {}
-        for signals in (self.inputs, self.outputs, self.states):
-            everything |= dict.fromkeys(signals, signals)
+        everything = {"t": self.t, **self.inputs, **self.outputs, **self.states}
         if name in everything:
-            return everything[name][name]
+            return everything[name]
         hats = [estimate + _HAT for estimate in self.estimates]
         if name in hats:
             return self.estimates[name.removesuffix(_HAT)]
-        known = ["t", *everything, *hats]
+        known = [*everything, *hats]
         raise UnknownNameError(str(unknown(f"this run has no signal {shown(name)}", name, known)))
 
     def __str__(self) -> str:
@@ -201,9 +198,8 @@ class Result:
         first, last = float(self.t[0]), float(self.t[-1])
         what = f"{details.settings.observer.get('name')}, {len(self.t)} times"
         if details.estimation is not None:
-            count = len(details.estimation.cases)
-            name = details.settings.estimator.get("name")
-            what += f", {name} with {count} case{'' if count == 1 else 's'}"
+            cases = counted(len(details.estimation.cases), "case")
+            what += f", {details.settings.estimator.get('name')} with {cases}"
         return f"<gpebo run of {details.system.name}, t = {first:g} to {last:g} s, {what}>"
 
     def _repr_html_(self) -> str:

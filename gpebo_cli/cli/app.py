@@ -103,20 +103,16 @@ def _was_interrupted(error: BaseException | None) -> bool:
 
 def _dispatch(words: list[str]) -> int:
     command, rest = (words[0], words[1:]) if words else ("--help", [])
-    if command in ("--help", "-h", "help"):
-        from gpebo_cli.cli.usage import help_of
-
-        sys.stdout.write(help_of())
-        return 0
-    if command in ("--version", "-V", "version"):
+    if command in ("--version", "-V", "version") or (command == "run" and "--version" in rest):
         from gpebo_cli._version import __version__
 
         sys.stdout.write(f"gpebo {__version__}\n")
         return 0
-    if command in COMMANDS and not {"--help", "-h"}.isdisjoint(rest):
+    of_all = command in ("--help", "-h", "help")
+    if of_all or (command in COMMANDS and not {"--help", "-h"}.isdisjoint(rest)):
         from gpebo_cli.cli.usage import help_of
 
-        sys.stdout.write(help_of(command))
+        sys.stdout.write(help_of("gpebo" if of_all else command))
         return 0
     if command in COMMANDS:
         from importlib import import_module

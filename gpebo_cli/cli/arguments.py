@@ -29,9 +29,7 @@ _WITH_VALUE = {
     **{flag: f"one of {', '.join(accepted)}" for flag, accepted in VALUES.items()},
     **dict.fromkeys(("--config-dir", "--config-name"), "a value"),
 }
-_SWITCHES = (
-    "--multirun", "--dry-run", "--quiet", "--verbose", "--resolve", "--hydra-help", "--version",
-)
+_SWITCHES = ("--multirun", "--dry-run", "--quiet", "--verbose", "--resolve", "--hydra-help")
 OPTIONS = (*_SWITCHES, *_WITH_VALUE)
 """Long names of all options of ``gpebo run``."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -145,6 +146,4 @@ def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
 
 
 def _wrapped(text: str, indent: str) -> list[str]:
-    import textwrap
-
     return textwrap.wrap(text, _WIDTH, initial_indent=indent, subsequent_indent=indent)

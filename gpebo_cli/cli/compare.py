@@ -42,8 +42,8 @@ def main(words: list[str]) -> int:
     metrics, best = shown_metrics(measured), ranking(measured)
     sort = arguments.values.get("--sort", best)
     known = comparison.names(cases)
-    asked = [name.strip() for name in arguments.values.get("--columns", "").split(",")]
-    asked = [name for name in asked if name]
+    given = arguments.values.get("--columns", "").split(",")
+    asked = list(filter(None, map(str.strip, given)))
     for option, name in (("--sort", sort), *(("--columns", name) for name in asked)):
         if name not in known:
             raise unknown(f"{option} {name}: no such column", name, known)

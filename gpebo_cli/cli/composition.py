@@ -80,7 +80,7 @@ class GpeboSource(ConfigSource):
 class Loader(ConfigLoaderImpl):
     """Hydra's, from our sources alone; a configuration that could run code is an error."""
 
-    def __init__(self, config_dir: str | None = None) -> None:
+    def __init__(self, config_dir: str | None) -> None:
         setbase("1.3")
         Plugins.instance()  # knows Hydra's own sources
         SourcesRegistry.instance().register(GpeboSource)

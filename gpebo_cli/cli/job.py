@@ -16,6 +16,7 @@ from gpebo_cli.cli import composition
 from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.configs import configuration
+from gpebo_cli.reading import as_seen_from_here
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import RunResult
@@ -49,7 +50,7 @@ def read_job(cfg: DictConfig, arguments: Arguments, *, draw: bool) -> Job:
     return Job(settings, system, configuration.complete(config, settings))
 
 
-def run_job(job: Job, folder: str, *, quiet: bool = False, loud: bool = False) -> RunResult:
+def run_job(job: Job, folder: str, *, quiet: bool, loud: bool) -> RunResult:
     """Run the experiment of ``job`` and write ``folder``."""
     # Only now, when the configuration is known to be good: half a second of imports.
     from gpebo_cli.experiment.pipeline import run_experiment
@@ -78,10 +79,10 @@ def remove_if_empty(folder: str) -> None:
 
 def described_in(chosen: Mapping[str, Any], arguments: Arguments) -> str:
     """Where the plant or regression that was chosen, or the primary configuration, was written."""
-    names = {group: chosen.get(group) for group in ("regression", "plant")}
-    inside = next((f"{g}/{name}" for g, name in names.items() if name), arguments.config_name)
+    files = (f"{group}/{chosen[group]}" for group in ("regression", "plant") if chosen.get(group))
+    inside = next(files, arguments.config_name)
     for folder in arguments.folders:
         path = os.path.join(folder, f"{inside}.yaml")
         if os.path.isfile(path):
-            return min(path, os.path.relpath(path), key=len)
+            return as_seen_from_here(path)
     return ""

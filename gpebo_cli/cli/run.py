@@ -21,12 +21,6 @@ STDIN = "-"  # as data.file: rows are read from standard input, as they come
 def main(words: list[str]) -> int:
     """Do what the words after ``gpebo run`` ask for; the exit code."""
     arguments = command_line.parse(words)
-    if "--version" in arguments.given.switches:
-        from gpebo_cli._version import __version__
-
-        sys.stdout.write(f"gpebo {__version__}\n")
-        return 0
-
     from gpebo_cli.cli import composition
 
     with composition.session(arguments) as hydra:

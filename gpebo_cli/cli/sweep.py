@@ -28,6 +28,7 @@ from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
+from gpebo_cli.model.matrix import counted
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.files import csv_text, make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
@@ -282,7 +283,7 @@ def _print_plan(records: Sequence[JobRecord], *, resumed: bool) -> None:
     ]
     done = sum(record.status == "done" for record in records)
     told = f", {done} of them done" if resumed else ""
-    lines = [*columns([head, *rows]), f"{_jobs(len(records))}{told}; nothing was run"]
+    lines = [*columns([head, *rows]), f"{counted(len(records), 'job')}{told}; nothing was run"]
     sys.stdout.write("".join(f"{line}\n" for line in lines))
 
 
@@ -300,7 +301,8 @@ def _print_table(records: Sequence[JobRecord], folder: Path, *, rows: bool) -> N
     count = Counter(record.status for record in records)
     lines.append(str(Path(os.path.relpath(folder)) / TABLE))
     missing = f", {count['missing']} missing" if count["missing"] else ""
-    lines.append(f"{_jobs(len(records))}, {count['done']} done, {count['failed']} failed{missing}")
+    jobs = counted(len(records), "job")
+    lines.append(f"{jobs}, {count['done']} done, {count['failed']} failed{missing}")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     sys.stdout.flush()  # before what follows on stderr
 
@@ -317,17 +319,13 @@ def _raise_failures(
         named = "; ".join(f"job {r.job}: {r.error}" for r in failed[:_NAMED_FAILURES])
         more = len(failed) - _NAMED_FAILURES
         tail = f"; and {more} more in {TABLE}" if more > 0 else ""
-        parts.append(f"{len(failed)} of {_jobs(len(records))} failed: {named}{tail}")
+        parts.append(f"{len(failed)} of {counted(len(records), 'job')} failed: {named}{tail}")
     if trouble:
         parts.append(f"the launcher gave up: {trouble[:300]}")
     if missing:
         why = " (fail_fast)" if stopped else ""
         parts.append(
-            f"{_jobs(len(missing))} without a result{why}; go on with "
+            f"{counted(len(missing), 'job')} without a result{why}; go on with "
             f"resume={os.path.relpath(folder)}"
         )
     raise GpeboError("; ".join(parts))
-
-
-def _jobs(count: int) -> str:
-    return "1 job" if count == 1 else f"{count} jobs"

@@ -18,7 +18,6 @@ from gpebo_cli.evidence.metrics import (
     settling_times,
 )
 from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics
-from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.observers import StateMap
 from gpebo_cli.observers._base import AffineStateMap
@@ -45,11 +44,12 @@ def sizes_of(truth: Array, natural: Array, x: Array) -> tuple[Array, Array]:
     return np.where(of_eta > _LEAST * natural, of_eta, np.fmax(of_eta, natural)), of_x
 
 
-def judged_of(source: Source, p: int) -> BoolArray:
-    """Which of the parameters (p,) are compared with the truth."""
-    judged = np.zeros(p, dtype=bool)
-    judged[source.judged] = True
-    return judged
+def judged_of(system: DescriptorSystem, p: int) -> BoolArray:
+    """Which of the parameters (p,) are compared with the truth.
+
+    Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts.
+    """
+    return np.arange(p) < (system.q if system.theta_varies else p)
 
 
 def _weights(sizes: Array, counted: BoolArray) -> Array:

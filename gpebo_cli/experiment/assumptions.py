@@ -64,17 +64,16 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
         recording = load(system, settings.data, settings.time, settings.solver.tol)
-        noise = signal_noise(settings.noise, levels, recording.rows)
+        noise = signal_noise(levels, recording.rows)
         seen = Measurements(recording.inputs, recording.outputs, noise, recording.derivatives)
         return Examination(()) if observer is None else _of_observer(
             observer, settings, system, seen, []
         )
-    found: list[Assumption] = []
     try:
         simulation = simulation_of(system, settings.time, settings.solver)
     except ModelError as error:
         return Examination((Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),))
-    found += of_simulation(system, simulation)
+    found = of_simulation(system, simulation)
     if observer is None:
         return Examination(tuple(found))
     if any(jump.impulses.any() for _, _, jump in simulation.jumps):
@@ -83,9 +82,8 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
         )
         return Examination(tuple(found))
     signals = simulation.signals
-    noise = signal_noise(settings.noise, levels)
     derivatives = InputDerivatives.of_plant(system, ~levels.noisy_inputs)
-    seen = Measurements(signals.inputs, signals.outputs, noise, derivatives)
+    seen = Measurements(signals.inputs, signals.outputs, signal_noise(levels), derivatives)
     return _of_observer(observer, settings, system, seen, found)
 
 

@@ -22,7 +22,6 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import ActiveBound
-from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Samples, Trajectory
 from gpebo_cli.observers import AffineStateMap, Observation
@@ -145,15 +144,6 @@ class BoundedEstimates:
     states: list[_Side]
     unknowns: list[_Row]
     active: dict[int, tuple[ActiveBound, ...]] = field(default_factory=dict)
-
-    def delta(self, t: Array) -> Array | None:
-        """Δ at the times t (M,), as without bounds."""
-        return self.plain.delta(t)
-
-    @property
-    def requirement(self) -> Requirement:
-        """That of the estimator."""
-        return self.plain.requirement
 
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases at the times, (g, M, p)."""

@@ -23,10 +23,10 @@ from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
-from gpebo_cli.experiment.bounds import BoundedEstimates, bounded
+from gpebo_cli.experiment.bounds import bounded
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
-from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
+from gpebo_cli.experiment.noise import signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
 from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
@@ -58,8 +58,8 @@ Stage = Callable[[str], AbstractContextManager[Pace]]
 
 
 def continuous(
-    result: RunResult, source: Source, levels: NoiseLevels, observer: Observer,
-    estimator: estimators.Estimator, stage: Stage,
+    result: RunResult, source: Source, observer: Observer, estimator: estimators.Estimator,
+    stage: Stage,
 ) -> RunResult:
     """The result with observer and estimator as differential equations (SolverError)."""
     settings, system = result.settings, result.system
@@ -72,7 +72,7 @@ def continuous(
             inside = (known.samples > known.t[0]) & (known.samples < known.t[-1])
             asked = np.union1d(known.t, known.samples[inside])
         seen = Measurements(
-            signals.inputs, signals.outputs, signal_noise(settings.noise, levels, known.rows),
+            signals.inputs, signals.outputs, signal_noise(source.levels, known.rows),
             known.derivatives, known.t if known.recording else None, asked,
             [
                 (each.inputs.mesh.size, each.inputs.mesh.points.size)
@@ -110,21 +110,20 @@ def continuous(
         except SolverError as error:
             raise SolverError("; ".join([str(error), *warnings(observation)])) from error
     why = ""
-    if source.noisy(levels) or observation.estimator is not None:
+    if source.noisy or observation.estimator is not None:
         with stage("uncertainty"):
             estimation, why = _with_deviations(
-                settings, observation, estimator, source, levels, known, estimation
+                settings, observation, estimator, source, known, estimation
             )
     fit = fit_of(observation, estimation, system, source) if source.recording else None
-    if fit is not None and settings.uncertainty and not levels.silent:
-        about = observation.evidence or observation
-        fit = replace(fit, ratio=residual_ratio(about, source, settings.noise, levels))
+    if fit is not None and settings.uncertainty:
+        fit = replace(fit, ratio=residual_ratio(observation.evidence or observation, source))
     noise = None
     if settings.noise.seeds > 1 and source.true is not None:
         with stage("seeds") as pace:
-            theta = source.theta(t[-1:])
             noise = over_seeds(
-                observation, observe, source.true, theta, estimator, settings.noise, levels, pace
+                observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
+                pace,
             )
     unknown = [
         name for name, is_known in told.items() if not (is_known or name in observation.unseen)
@@ -138,14 +137,14 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why), noisy=source.noisy(levels),
+        _gains(observation, estimation), _no_deviations(why),
     )
 
 
 def _completed(
     found: RunResult, source: Source, observed: Observed, unknown: Sequence[str],
     excitation: Excitation, estimation: EstimationResult, metrics: Metrics, gains: Array | None,
-    note: str, *, noisy: bool,
+    note: str,
 ) -> RunResult:
     """What was ``found`` with the rest that observer and estimator made of a source, and its words.
 
@@ -153,7 +152,7 @@ def _completed(
     ``accuracy.standing``, and the ``note`` is for the last line of a run, from "; " on.
     """
     system, simulation, recording = found.system, found.simulation, found.recording
-    if noisy:
+    if source.noisy:
         metrics = accuracy.standing(estimation, metrics, gains, system, found.noise)
     # A result that is kept for what it has to tell must not keep what the observer made.
     of_source, growth = source.assumptions, (observed.growth, observed.growth_rate)
@@ -163,7 +162,7 @@ def _completed(
         found.left_out, estimation.active,
     )
     notes = observed.note + note + simulation_note(simulation, found.settings.solver.tol)
-    notes += functions_note(system, simulation or recording)
+    notes += functions_note(system, found.signals)
     notes += recording.note if recording else ""
     return replaced(
         found, excitation=excitation, estimation=estimation, metrics=metrics,
@@ -175,7 +174,7 @@ def _completed(
 
 def _with_deviations(
     settings: Settings, observation: Observation, estimator: estimators.Estimator, source: Source,
-    levels: NoiseLevels, known: Knowledge, estimation: EstimationResult,
+    known: Knowledge, estimation: EstimationResult,
 ) -> tuple[EstimationResult, str]:
     """With standard deviations, or why there are none (not, if nobody asked)."""
     if isinstance(observation.state_map, Filtering):
@@ -186,8 +185,8 @@ def _with_deviations(
         return estimation, ""
     some, columns = _about(observation, known.independent)
     found = standard_deviations(
-        replace(observation, regression=some), estimator, source, settings.noise, levels,
-        estimation.t, estimation.states, columns,
+        replace(observation, regression=some), estimator, source, estimation.t, estimation.states,
+        columns,
     )
     if isinstance(found, str):
         return estimation, found
@@ -226,8 +225,8 @@ def _gains(observation: Observation, estimation: EstimationResult) -> Array | No
 
 
 def at_samples(
-    result: RunResult, source: Source, levels: NoiseLevels, samples: Sampling,
-    estimator: estimators.Estimator, stage: Stage,
+    result: RunResult, source: Source, samples: Sampling, estimator: estimators.Estimator,
+    stage: Stage,
 ) -> RunResult:
     """The same at samples of the signals, ``samples.step`` apart (ConfigError)."""
     settings, system = result.settings, result.system
@@ -243,12 +242,10 @@ def at_samples(
         def fed(
             by: estimators.Estimator, columns: IntArray | None, *, last: bool
         ) -> tuple[Online, list[OnlineEstimates]]:
-            wanted = (
-                sampled_deviations(settings.noise, levels, source)
-                if settings.uncertainty and last else None
-            )
+            wanted = settings.uncertainty and last
             online = Online(
-                settings, system, samples.hold, start, np.append(u[0], y[0]), by, wanted,
+                settings, system, samples.hold, start, np.append(u[0], y[0]), by,
+                sampled_deviations(source.levels, source) if wanted else None,
                 source.derivatives, columns,
             )
             made = []
@@ -278,7 +275,7 @@ def at_samples(
         states = made.states * accuracy.told(made.seen[-1])
         sizes = accuracy.sizes_of(truth, online.natural_sizes, x)
         metrics = accuracy.metrics_of(accuracy.numbers_of(
-            t, parameters - truth, states - x, sizes, accuracy.judged_of(source, truth.shape[1])
+            t, parameters - truth, states - x, sizes, accuracy.judged_of(system, truth.shape[1])
         ), online.parameters, system)
     chosen = kept_samples(1, len(t), settings.time.samples)
     kept = chosen[kept_samples(len(online.cases), len(chosen), settings.output.max_rows)]
@@ -304,7 +301,7 @@ def at_samples(
     times = estimable(
         excitation.known, excitation.t, online.parameters, system.states, made.seen[chosen]
     )
-    rows, noisy = made.regression.rows[1 + chosen], source.noisy(levels)
+    rows = made.regression.rows[1 + chosen]
     sampled = RegressionResult(
         t[chosen], rows[..., -1], rows[..., :-1], online.parameters, online.error_estimate
     )
@@ -315,7 +312,7 @@ def at_samples(
     return _completed(
         found, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
-        _no_deviations(why) if noisy else _held(samples, metrics), noisy=noisy,
+        _no_deviations(why) if source.noisy else _held(samples, metrics),
     )
 
 
@@ -363,16 +360,16 @@ def _estimate(
     about_own = observation.names is None and observation.estimator is None
     determined = known.parameters[-1] if about_own else np.ones(p, dtype=bool)
     seen = seen if about_own else np.ones(n, dtype=bool)
-    about = observation, grid, kept, known.independent
-    estimates, columns = _estimates(estimator, *about)
-    requirement = estimates.requirement
+    plain, columns = _estimates(estimator, observation, grid, kept, known.independent)
+    requirement, held = plain.requirement, None
     if observation.bounds:
-        estimates = bounded(observation.bounds, system, observation, columns, estimates, grid)
+        held = bounded(observation.bounds, system, observation, columns, plain, grid)
+    estimates = held or plain
     told = accuracy.told(determined), accuracy.told(seen)
     natural = accuracy.natural_sizes(regression, p)
     sizes = accuracy.sizes_of(truth, natural, x)
     evaluate = accuracy.evaluation(
-        state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(source, p), chosen,
+        state_map, grid, truth * told[0], x * told[1], sizes, accuracy.judged_of(system, p), chosen,
         each=each, alone=size == 1,
     )
     parameters, estimated = np.empty((size, len(kept), p)), np.empty((size, len(kept), n))
@@ -393,9 +390,9 @@ def _estimate(
     estimated[..., np.isnan(told[1])] = np.nan
     result = EstimationResult(
         cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
-        true_parameters=truth[chosen], states=estimated, delta=lambda: estimates.delta(kept),
+        true_parameters=truth[chosen], states=estimated, delta=lambda: plain.delta(kept),
         checks=state_map.checks(kept, estimated), requirement=requirement, explaining=explaining,
-        active=estimates.active if isinstance(estimates, BoundedEstimates) else {},
+        active=held.active if held else {},
         doubts=(lambda: _doubts(
             settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
             columns, requirement,

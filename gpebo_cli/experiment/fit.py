@@ -45,10 +45,7 @@ def fit_of(
     fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)), least)
     if changing:
         return fit
-    return _explained(
-        fit, final[fit.best], about, system, source,
-        every=regression.factor is None and not source.pieces,
-    )
+    return _explained(fit, final[fit.best], about, system, source)
 
 
 def _varies_slowly(residual: Array) -> bool:
@@ -104,13 +101,12 @@ def _step(y: Array) -> float:
 
 
 def _explained(
-    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source, *,
-    every: bool,
+    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source
 ) -> Fit:
     """With ŷ of the final estimates η̂ (p,), and how white y − ŷ is.
 
     ŷ is C x̂ + D u + H θ̂ of a plant, and ψη̂ of a regression whose Y is measured. Whiteness is
-    looked at at ``every`` sample, or at the output times if x̂ is known there only.
+    looked at at every sample, or at the output times if x̂ is known there only.
     """
     t, recording, state_map = source.t, source.recording, observation.state_map
     if recording is None or len(state_map.times):
@@ -131,7 +127,7 @@ def _explained(
     fit = replace(fit, outputs=fitted)
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
-    if every:
+    if observation.regression.factor is None and not source.pieces:
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.

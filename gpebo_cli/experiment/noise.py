@@ -43,6 +43,7 @@ _RESOLVED = 1e-10  # of a sample: what a polynomial may miss of the interpolant
 class NoiseLevels:
     """Standard deviations and steps per signal, zeros where there is no noise."""
 
+    settings: NoiseSettings  # which say when it is sampled, too
     outputs: Array  # (r,) σ
     inputs: Array  # (m,) σ
     steps: Array  # (r,) of quantisation
@@ -60,14 +61,9 @@ class NoiseLevels:
 
 def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLevels:
     """The levels by output and input of a plant, checked (ConfigError)."""
-    if not (np.isfinite(settings.sample_time) and settings.sample_time > 0):
-        raise ConfigError(
-            f"noise.sample_time: expected a positive number of seconds, got {settings.sample_time}"
-        )
-    if settings.seed < 0:
-        raise ConfigError(f"noise.seed: expected 0 or more, got {settings.seed}")
     outputs, inputs = system.outputs, system.inputs
     levels = NoiseLevels(
+        settings,
         per_name(settings.outputs, outputs, "output", "noise.outputs", absent=0.0),
         per_name(settings.inputs, inputs, "input", "noise.inputs", absent=0.0),
         per_name(settings.quantisation, outputs, "output", "noise.quantisation", absent=0.0),
@@ -80,15 +76,13 @@ def noise_levels(settings: NoiseSettings, system: DescriptorSystem) -> NoiseLeve
     return levels
 
 
-def signal_noise(
-    settings: NoiseSettings, levels: NoiseLevels, rows: Rows | None = None
-) -> SignalNoise:
+def signal_noise(levels: NoiseLevels, rows: Rows | None = None) -> SignalNoise:
     """What an observer is told of the noise: rounding to steps of Δ has a variance of Δ²/12.
 
     A recording has ``rows`` of its own.
     """
     outputs = np.sqrt(levels.outputs**2 + levels.steps**2 / 12.0)
-    step = settings.sample_time if rows is None else float(np.diff(rows.t).mean())
+    step = levels.settings.sample_time if rows is None else float(np.diff(rows.t).mean())
     return SignalNoise(levels.inputs, outputs, step, rows)
 
 
@@ -111,17 +105,6 @@ class SampledMesh:
         return int(self.sample[-1]) + 1
 
 
-def check_samples(horizon: float, sample_time: float, max_elements: int) -> None:
-    """Refuse more samples than elements are allowed (ConfigError: names both numbers)."""
-    samples = horizon / sample_time
-    if samples > max_elements:
-        raise ConfigError(
-            f"noise.sample_time = {sample_time:g} s makes {samples:.6g} samples over "
-            f"{horizon:g} s, and each needs an element; solver.max_elements is {max_elements}. "
-            "Raise one of them"
-        )
-
-
 def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     """``mesh`` with every sample instant an edge; its own edges stay.
 
@@ -137,20 +120,20 @@ def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     return SampledMesh(Mesh(edges, mesh.rule), sample, sample_time)
 
 
-def measure(signals: Signals, settings: NoiseSettings, levels: NoiseLevels) -> Signals:
+def measure(signals: Signals, levels: NoiseLevels, seed: int) -> Signals:
     """u + e, y + e and the true states, on a mesh that ends elements at the sample instants.
 
     Without noise these are ``signals`` themselves, to the last bit.
     """
     if levels.silent:
         return signals
-    grid = noise_grid(signals.mesh, settings)
+    grid, shape = noise_grid(signals.mesh, levels.settings), levels.settings.shape
     mesh = grid.mesh
     true = Signals(*map(mesh.along, (signals.inputs, signals.outputs, signals.states)))
-    of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, settings.seed)
+    of_outputs, of_inputs = draw_errors(true.outputs, grid, levels, seed)
     return Signals(
-        Trajectory(mesh, true.inputs.values + between(of_inputs, grid, settings.shape)),
-        Trajectory(mesh, true.outputs.values + between(of_outputs, grid, settings.shape)),
+        Trajectory(mesh, true.inputs.values + between(of_inputs, grid, shape)),
+        Trajectory(mesh, true.outputs.values + between(of_outputs, grid, shape)),
         true.states,
     )
 

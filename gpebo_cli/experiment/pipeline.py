@@ -25,7 +25,7 @@ from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.experiment.seeds import check_seeds, refuse_seeds
 from gpebo_cli.experiment.uncertainty import sampled_deviations
-from gpebo_cli.experiment.verdict import functions_note, verdict
+from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
@@ -88,7 +88,7 @@ def run_experiment(
     observer = build(settings.observer)
     if observer is not None and estimator is None:
         estimator = estimators.build(settings.estimator)
-    check_seeds(settings.noise, levels, settings.time.horizon)
+    check_seeds(levels, settings.time.horizon)
     limits.check(settings, system, levels, 0 if estimator is None else len(estimator.cases))
     if isinstance(estimator, estimators.Fitting):
         given = system.regression
@@ -103,20 +103,18 @@ def run_experiment(
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])
-    note = functions_note(system, source.simulation or source.recording)
     of_source = source.assumptions
     result = RunResult(
-        settings=settings, system=system, simulation=source.simulation, regression=None,
-        excitation=None, estimation=None, metrics=None, timings=seconds,
-        assumptions=lambda: tuple(of_source()), verdict=source.verdict + note,
-        recording=source.recording,
+        settings=settings, system=system, simulation=source.simulation,
+        recording=source.recording, timings=seconds, assumptions=lambda: tuple(of_source()),
+        verdict=source.verdict,
     )
     if observer is None or estimator is None:
         refuse_seeds(settings.noise)
         return result
     if samples is None:
-        return continuous(result, source, levels, observer, estimator, stage)
-    return at_samples(result, source, levels, samples, estimator, stage)
+        return continuous(result, source, observer, estimator, stage)
+    return at_samples(result, source, samples, estimator, stage)
 
 
 def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Array], Online]:
@@ -124,17 +122,15 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
 
     ConfigError: a setting that needs to know how a recording goes on.
     """
-    sources.check_stream(settings, system)
+    levels = noise_levels(settings.noise, system)
+    sources.check_stream(settings, system, levels)
     estimator = estimators.build(settings.estimator)
     if len(estimator.cases) > 1:
         raise ConfigError(
             f"the gains of the estimator make {len(estimator.cases)} cases; a stream has room for "
             "one"
         )
-    deviations = None
-    if settings.uncertainty:
-        levels = noise_levels(settings.noise, system)
-        deviations = sampled_deviations(settings.noise, levels, None)
+    deviations = sampled_deviations(levels, None) if settings.uncertainty else None
     return lambda start, sample: Online(
         settings, system, holds(settings.data.hold, system), start, sample, estimator, deviations
     )

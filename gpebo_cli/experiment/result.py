@@ -61,6 +61,7 @@ class SignalsResult:
     elements: int
     measured_inputs: Array | None = None  # (N, m) what the observer saw; None: the same
     measured_outputs: Array | None = None  # (N, r)
+    bounded: bool = True  # known functions are, between the times at which they are evaluated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,7 +75,6 @@ class RecordingResult(SignalsResult):
     first: float  # times of its first and last sample
     last: float
     known_states: tuple[str, ...]
-    bounded: bool  # known functions are, between the times at which they are evaluated
     note: str = ""  # what the last line of a run has to say of it, from "; " on
 
 
@@ -94,7 +94,6 @@ class SimulationResult(SignalsResult):
     state_errors: Array | None = None  # (n,) the estimate for each state, relative to its own size
     vague: tuple[str, ...] = ()  # states of which few digits are known
     linear_solves: float | None = None  # what Newton's method cost; None: the plant is linear
-    bounded: bool = True  # known functions are, between the times at which they are evaluated
 
 
 @dataclass(frozen=True)
@@ -163,6 +162,12 @@ class NoiseStatistics:
     rms: Array  # (G, p) root mean square error
 
 
+def place_of_least(values: Array) -> int | None:
+    """Place of the least finite value of (g,), None if there is none."""
+    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
+    return place if np.isfinite(values[place]) else None
+
+
 @dataclass(frozen=True)
 class Fit:
     """How well the final estimates explain all data: what is known without the truth."""
@@ -192,10 +197,10 @@ class Fit:
     @property
     def best(self) -> int:
         """The case with the least residual."""
-        return int(np.argmin(np.where(np.isfinite(self.residual), self.residual, np.inf)))
+        return place_of_least(self.residual) or 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunResult:
     """Everything one run produced; the later stages are None when ``observer=none``.
 
@@ -205,16 +210,16 @@ class RunResult:
 
     settings: Settings
     system: DescriptorSystem
-    simulation: SimulationResult | None
-    regression: RegressionResult | None
-    excitation: Excitation | None
-    estimation: EstimationResult | None
-    metrics: Metrics | None
+    simulation: SimulationResult | None = None
+    recording: RecordingResult | None = None
+    regression: RegressionResult | None = None
+    excitation: Excitation | None = None
+    estimation: EstimationResult | None = None
+    metrics: Metrics | None = None
     timings: Mapping[str, float]  # stage -> seconds
     assumptions: OnDemand[tuple[Assumption, ...]] = OnDemand()
     verdict: OnDemand[str] = OnDemand()  # the last line a person reads
     noise: NoiseStatistics | None = None  # where more than one seed was asked for
-    recording: RecordingResult | None = None
     fit: Fit | None = None  # of a recording
     # From when on each parameter and state is determined by the data, None: never.
     estimable: OnDemand[Mapping[str, float | None]] = OnDemand(dict)

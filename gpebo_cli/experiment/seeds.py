@@ -9,7 +9,6 @@ Where it does (matrices along noisy signals, resets at estimates), every seed is
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 
 import numpy as np
 
@@ -38,8 +37,9 @@ _NUMBERS = 1 << 20  # in Y of one batch of seeds; estimators hold tens of times 
 _MOST_SAMPLES = 2e6  # of all seeds: some twenty seconds
 
 
-def check_seeds(settings: NoiseSettings, levels: NoiseLevels, horizon: float) -> None:
+def check_seeds(levels: NoiseLevels, horizon: float) -> None:
     """Refuse many seeds of nothing, and more samples than can be computed soon (ConfigError)."""
+    settings = levels.settings
     if settings.seeds > 1 and levels.silent:
         raise ConfigError(f"noise.seeds = {settings.seeds}, but there is no noise; set its levels")
     samples = settings.seeds * horizon / settings.sample_time
@@ -61,8 +61,7 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
-    theta: Array, estimator: Estimator, settings: NoiseSettings, levels: NoiseLevels,
-    pace: Pace,
+    theta: Array, estimator: Estimator, levels: NoiseLevels, pace: Pace,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
@@ -70,16 +69,17 @@ def over_seeds(
     the true ones, and ``theta`` (1, q) is what the unknowns really are at the horizon.
     """
     horizon = observation.regression.mesh.edges[-1:]
+    settings = levels.settings
     seeds = range(settings.seed, settings.seed + settings.seeds)
     done = pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases")
 
     def estimated() -> Iterator[tuple[Observation, Estimates]]:
         if observation.respond is not None:
-            for many in _added(observation, observation.respond, signals, settings, levels):
+            for many in _added(observation, observation.respond, signals, levels):
                 yield observation, estimator.estimate(many, horizon)
             return
         for seed in seeds:
-            own = observe(measure(signals, replace(settings, seed=seed), levels))
+            own = observe(measure(signals, levels, seed))
             yield own, estimate(own.estimator or estimator, own.regression, horizon)
 
     found = list[Array]()
@@ -123,11 +123,10 @@ def _truth(observation: Observation, horizon: Array, theta: Array, signals: Sign
 
 
 def _added(
-    observation: Observation, respond: Response, signals: Signals, settings: NoiseSettings,
-    levels: NoiseLevels,
+    observation: Observation, respond: Response, signals: Signals, levels: NoiseLevels,
 ) -> Iterator[LinearRegression]:
     """The regression with the noise of many seeds at once, batch by batch."""
-    regression = observation.regression
+    regression, settings = observation.regression, levels.settings
     mesh = regression.mesh
     samples = noise_grid(signals.mesh, settings)
     outputs = samples.mesh.along(signals.outputs)

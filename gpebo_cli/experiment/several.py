@@ -36,7 +36,6 @@ def joined_source(sources: Sequence[Source]) -> Source:
 
     t = together([source.t for source in sources], shifts)
     rows = [source.rows for source in sources if source.rows is not None]
-    known = [set(each.known_states) for each in recordings]
     recording = replace(
         recordings[0], t=t,
         inputs=together([each.inputs for each in recordings]),
@@ -46,7 +45,8 @@ def joined_source(sources: Sequence[Source]) -> Source:
         sha256=", ".join(each.sha256 for each in recordings),
         rows=sum(each.rows for each in recordings), last=recordings[-1].last + shifts[-1],
         known_states=tuple(
-            name for name in recordings[0].known_states if all(name in each for each in known)
+            name for name in recordings[0].known_states
+            if all(name in each.known_states for each in recordings)
         ),
         elements=sum(each.elements for each in recordings),
         bounded=all(each.bounded for each in recordings),
@@ -75,9 +75,8 @@ def joined_observation(
             "data.file: several files need an observer whose parameters are θ and the initial "
             "error; accepted are observer=gpebo with the remedies none and output_injection"
         )
-    shifts, first = _shifts(sources), observations[0]
-    own = [each.regression.p - q for each in observations]
-    places = [q + k for k in accumulate(own, initial=0)]
+    shifts, regressions = _shifts(sources), [each.regression for each in observations]
+    places = list(accumulate((each.p - q for each in regressions), initial=q))
     p = places[-1]
 
     def wide(values: Array, k: int) -> Array:
@@ -88,9 +87,8 @@ def joined_observation(
 
     names = [
         name if not k else f"{name}_{k + 1}"
-        for k, each in enumerate(observations) for name in each.regression.parameters[q:]
+        for k, each in enumerate(regressions) for name in each.parameters[q:]
     ]
-    regressions = [each.regression for each in observations]
     factors = [each.factor for each in regressions if each.factor is not None]
     rows = max(each.psi.values.shape[2] for each in regressions)
     psi = _joined([
@@ -103,9 +101,7 @@ def joined_observation(
     ])
     same = all(each.psi.values.shape[2] == rows for each in regressions)
     errors = [each.errors for each in observations if each.errors is not None]
-    starts = np.array([
-        each.regression.mesh.edges[0] + by for each, by in zip(observations, shifts, strict=True)
-    ])
+    starts = np.array([each.mesh.edges[0] for each in regressions]) + shifts
 
     def errors_at(k: int, t: Array, inside: Array) -> ErrorSystem:
         return errors[k](t - shifts[k], inside - shifts[k])
@@ -122,7 +118,7 @@ def joined_observation(
     growth = [each.growth for each in observations if each.growth is not None]
     rates = [each.growth_rate for each in observations if each.growth_rate is not None]
     return replace(
-        first,
+        observations[0],
         regression=LinearRegression(
             _joined([
                 Trajectory(each.mesh, _filled(each.Y.values, rows)) for each in regressions

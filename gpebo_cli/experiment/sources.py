@@ -11,9 +11,14 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.assumptions import of_simulation
-from gpebo_cli.experiment.noise import NoiseLevels, check_samples, measure, noise_levels
+from gpebo_cli.experiment.noise import NoiseLevels, measure
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
-from gpebo_cli.experiment.verdict import pauses_note, rows_note, simulation_verdict
+from gpebo_cli.experiment.verdict import (
+    functions_note,
+    pauses_note,
+    rows_note,
+    simulation_verdict,
+)
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -40,13 +45,13 @@ class Source:
     """What the observer gets to see, and what is known about it."""
 
     t: Array  # (N,) the output grid
+    levels: NoiseLevels  # of the noise, of a recording as far as they are given
     inputs: Trajectory  # (m,)
     outputs: Trajectory  # (r,)
     states: Trajectory  # (n,) the truth, NaN where nobody knows
     theta: Callable[[Array], Array]  # times (M,) -> (M, q), likewise
-    judged: slice  # parameters that count when estimates are compared with the truth
     assumptions: Callable[[], Sequence[Assumption]]  # of the plant, when they are asked for
-    verdict: str
+    verdict: str = ""  # where nothing is estimated
     derivatives: InputDerivatives | None = None  # of the inputs, as far as they are known
     true: Signals | None = None  # of a simulation, without noise
     simulation: SimulationResult | None = None
@@ -56,9 +61,10 @@ class Source:
     pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
-    def noisy(self, levels: NoiseLevels) -> bool:
+    @property
+    def noisy(self) -> bool:
         """Whether there are errors in what the observer gets to see."""
-        return self.recording is not None or not levels.silent
+        return self.recording is not None or not self.levels.silent
 
 
 def simulated(
@@ -68,7 +74,7 @@ def simulated(
     start = settings.time.start
     t = _grid(settings, samples, start, start + settings.time.horizon)
     simulation = simulation_of(system, settings.time, settings.solver)
-    measured = measure(simulation.signals, settings.noise, levels)
+    measured = measure(simulation.signals, levels, settings.noise.seed)
     simulated = _sample_simulation(system, simulation, t)
     if not levels.silent:
         # Without noise of its own a signal keeps its bits; the finer mesh only adds rounding.
@@ -86,26 +92,26 @@ def simulated(
             "observer=none to simulate only"
         )
     return Source(
-        t=t, inputs=measured.inputs, outputs=measured.outputs, states=simulation.signals.states,
-        theta=system.theta_at, judged=_judged(system),
+        t=t, levels=levels, inputs=measured.inputs, outputs=measured.outputs,
+        states=simulation.signals.states, theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
-        verdict=simulation_verdict(simulated),
+        verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
         true=simulation.signals, simulation=simulated,
     )
 
 
 def recorded(
-    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None  # noqa: ARG001  a source like the other
+    settings: Settings, system: DescriptorSystem, levels: NoiseLevels, samples: Sampling | None
 ) -> Source:
     """Signals of a recording; nobody knows what θ was when it was made."""
     recording = load(system, settings.data, settings.time, settings.solver.tol)
     t, table = _grid(settings, samples, *recording.span), recording.table
     samples_t = table.samples.t
     return Source(
-        t=t, inputs=recording.inputs, outputs=recording.outputs, states=recording.states,
-        theta=lambda at: np.full((len(at), system.q), np.nan), judged=_judged(system),
-        assumptions=tuple, verdict="", derivatives=recording.derivatives,
+        t=t, levels=levels, inputs=recording.inputs, outputs=recording.outputs,
+        states=recording.states, theta=lambda at: np.full((len(at), system.q), np.nan),
+        assumptions=tuple, derivatives=recording.derivatives,
         rows=recording.rows, samples=samples_t[table.measured],
         recording=RecordingResult(
             **vars(recording.sampled(t)), file=table.header.source, sha256=table.sha256,
@@ -124,16 +130,20 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
 
     ConfigError: names the key and what it may be.
     """
-    time, recorded = settings.time, settings.data.name == "csv"
-    if recorded and settings.observer["name"] == "none":
-        raise ConfigError(
-            "observer=none simulates the plant, and data=csv does not; choose one of them"
-        )
-    if recorded:
-        _refuse_made_up(settings, levels)
+    if settings.data.name == "csv":
+        if settings.observer["name"] == "none":
+            raise ConfigError(
+                "observer=none simulates the plant, and data=csv does not; choose one of them"
+            )
+        _refuse_made_up(levels)
         return
-    if not levels.silent:
-        check_samples(time.horizon, settings.noise.sample_time, settings.solver.max_elements)
+    time, step, most = settings.time, settings.noise.sample_time, settings.solver.max_elements
+    if not levels.silent and time.horizon / step > most:
+        raise ConfigError(
+            f"noise.sample_time = {step:g} s makes {time.horizon / step:.6g} samples over "
+            f"{time.horizon:g} s, and each needs an element; solver.max_elements is {most}. "
+            "Raise one of them"
+        )
     if not time.horizon >= max(abs(time.start) * _RESOLVED, 1.0 / LARGEST):
         raise ConfigError(
             f"time.horizon = {time.horizon:g} s is too short to be resolved beside time.start = "
@@ -141,20 +151,20 @@ def check(settings: Settings, levels: NoiseLevels) -> None:
         )
 
 
-def _refuse_made_up(settings: Settings, levels: NoiseLevels) -> None:
-    if settings.noise.seeds > 1 or levels.steps.any():
+def _refuse_made_up(levels: NoiseLevels) -> None:
+    if levels.settings.seeds > 1 or levels.steps.any():
         raise ConfigError(
             "noise.seeds and noise.quantisation are for simulations; what is recorded or streamed "
             "has its own noise, of which noise.outputs and noise.inputs say how large it is"
         )
 
 
-def check_stream(settings: Settings, system: DescriptorSystem) -> None:
+def check_stream(settings: Settings, system: DescriptorSystem, levels: NoiseLevels) -> None:
     """Refuse what would need later rows of a recording, whose rows come one after the other.
 
     ConfigError: names the key and what it may be.
     """
-    _refuse_made_up(settings, noise_levels(settings.noise, system))
+    _refuse_made_up(levels)
     if "cubic" in each_of(holds(settings.data.hold, system), 1):
         raise ConfigError(
             "data.hold=cubic needs to know the samples to come; a stream takes zoh or linear"
@@ -191,11 +201,6 @@ def sample_times(step: float, start: float, stop: float) -> Array:
             "one run"
         )
     return np.asarray(start + step * np.arange(count + 1), dtype=np.float64)
-
-
-def _judged(system: DescriptorSystem) -> slice:
-    """Where θ varies e₀ makes up for it, and of what size it is says nothing: θ is what counts."""
-    return slice(system.q if system.theta_varies else None)
 
 
 def _sample_simulation(

@@ -15,7 +15,6 @@ from gpebo_cli.observers._base import Differentiable, Observation
 from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.settings import NoiseSettings
 
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
 # Why there are no deviations.
@@ -32,9 +31,7 @@ _IN_MATRICES = (
 )
 
 
-def sampled_deviations(
-    noise: NoiseSettings, levels: NoiseLevels, source: Source | None
-) -> SampledDeviations | None:
+def sampled_deviations(levels: NoiseLevels, source: Source | None) -> SampledDeviations | None:
     """Deviations of an observer at samples; None if there is no noise.
 
     Levels that are zero are unknown but for a simulation. Without a source the samples are a
@@ -43,10 +40,10 @@ def sampled_deviations(
     recorded = source is None or source.rows is not None
     if levels.silent and not recorded:
         return None
-    variances = _variances(noise, levels)
+    variances = _variances(levels)
     if source is None:
         return SampledDeviations(variances, None, relative=levels.silent)
-    rows = _rows(source, noise)
+    rows = _rows(source)
     instants = rows.t
     if not rows.lines:  # nothing is held from the end on
         instants = instants[: np.searchsorted(instants, source.inputs.mesh.edges[-1])]
@@ -63,42 +60,40 @@ def none_at_samples(cases: int) -> str:
     return _MANY.format(cases) if cases > MOST_CASES else f"{_IN_MATRICES}, or {_NOT_SAID}"
 
 
-def residual_ratio(
-    observation: Observation, source: Source, noise: NoiseSettings, levels: NoiseLevels
-) -> float | None:
+def residual_ratio(observation: Observation, source: Source) -> float | None:
     """√(χ² per degree of freedom) of a recording's residual, for levels that are given.
 
     One where the sensors' noise is all that the estimates leave; None: nobody can tell.
     """
-    if observation.errors is None or levels.silent or source.rows is None:
+    if observation.errors is None or source.levels.silent or source.rows is None:
         return None
     if observation.regression.resets or observation.regression.dynamics is not None:
         return None
     found = noise_level(
-        observation.errors, observation.regression, source.rows, _variances(noise, levels),
+        observation.errors, observation.regression, source.rows, _variances(source.levels),
         observation.starts,
     )
     return None if np.isnan(found) else found
 
 
-def _rows(source: Source, noise: NoiseSettings) -> Rows:
+def _rows(source: Source) -> Rows:
     """What the signals are samples of."""
     if source.rows is not None:
         return source.rows
     start, stop = source.inputs.mesh.edges[[0, -1]].tolist()
-    return Rows(np.arange(start, stop, noise.sample_time))
+    return Rows(np.arange(start, stop, source.levels.settings.sample_time))
 
 
-def _variances(noise: NoiseSettings, levels: NoiseLevels) -> Array:
+def _variances(levels: NoiseLevels) -> Array:
     """Of [u; y], (m + r,); of a recording without levels relative to that of all outputs."""
     if levels.silent:
         return np.concatenate([np.zeros(len(levels.inputs)), np.ones(len(levels.outputs))])
-    return signal_noise(noise, levels).variances
+    return signal_noise(levels).variances
 
 
 def standard_deviations(
-    observation: Observation, estimator: Estimator, source: Source, noise: NoiseSettings,
-    levels: NoiseLevels, t: Array, states: Array, columns: IntArray | slice = slice(None),
+    observation: Observation, estimator: Estimator, source: Source, t: Array, states: Array,
+    columns: IntArray | slice = slice(None),
 ) -> tuple[Array, Array] | str:
     """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
 
@@ -120,9 +115,8 @@ def standard_deviations(
         return _NOT_SAID
     if len(estimator.cases) > MOST_CASES:
         return _MANY.format(len(estimator.cases))
-    edges, rows = regression.mesh.edges, _rows(source, noise)
-    variances = _variances(noise, levels)
-    if levels.silent:
+    edges, rows, variances = regression.mesh.edges, _rows(source), _variances(source.levels)
+    if source.levels.silent:
         level = _level(errors, regression, rows, variances, observation.starts)
         if np.isnan(level):
             return _FEW

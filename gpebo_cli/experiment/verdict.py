@@ -10,10 +10,17 @@ import numpy as np
 from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment.doubts import WORSE
-from gpebo_cli.experiment.result import ActiveBound, Fit, RecordingResult, SimulationResult
+from gpebo_cli.experiment.result import (
+    ActiveBound,
+    Fit,
+    SignalsResult,
+    SimulationResult,
+    place_of_least,
+)
 from gpebo_cli.findings import Requirement
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
+from gpebo_cli.model.matrix import counted
 from gpebo_cli.numerics.rows import Rows
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
@@ -57,10 +64,8 @@ def verdict(
             near = "below 1 %" if reached else "all within ±2σ of the end"
             reached = f", {near} after {seconds:.4g} s"
         parts.append(f"state error {metrics.final_error_states[best]:.2g} at the end{reached}")
-    elif fit is not None:
-        best = fit.best
     else:
-        best = 0
+        best = 0 if fit is None else fit.best
     if fit is not None:
         parts.append(
             f"|Y − ψη̂| with the final estimates is {fit.residual[best]:.2g}, |Y| is "
@@ -177,20 +182,18 @@ def pauses_note(rows: Rows) -> str:
         "the last sample is held", "data.hold=linear, or "
     )
     return (
-        f"; through {len(long)} pause{'s' * (len(long) > 1)} of up to {long.max():.3g} s {how} "
+        f"; through {counted(len(long), 'pause')} of up to {long.max():.3g} s {how} "
         f"(data.hold={rows.hold}), which biases estimates beyond their deviations if the plant "
         f"moves meanwhile: take {instead}a file for each part (data.file=[…])"
     )
 
 
-def functions_note(
-    system: DescriptorSystem, simulated: SimulationResult | RecordingResult | None
-) -> str:
+def functions_note(system: DescriptorSystem, signals: SignalsResult) -> str:
     """What the last line of a run has to say of functions without bounds, from "; " on."""
     source = system.coefficients
     if isinstance(source, FunctionCoefficients) and source.functions:
         which = f"functions from Python ({', '.join(source.functions)})"
-    elif simulated is not None and not simulated.bounded:
+    elif not signals.bounded:
         which = "functions that change so often"
     else:
         return ""
@@ -204,15 +207,11 @@ def _best_case(metrics: Metrics) -> int | None:
     noise both are chance, and the least error over the whole run counts. None where the error of no
     case is a number.
     """
-    least_error = _least(metrics.final_error_states)
+    least_error = place_of_least(metrics.final_error_states)
     if least_error is None:
         return None
     noisy = metrics.seconds_to_settled is not None
-    first = _least(metrics.rms_error_states if noisy else metrics.seconds_to_1pct_states)
+    first = place_of_least(
+        metrics.rms_error_states if noisy else metrics.seconds_to_1pct_states
+    )
     return least_error if first is None else first
-
-
-def _least(values: Array) -> int | None:
-    """Place of the least finite value of (g,), None if there is none."""
-    place = int(np.argmin(np.where(np.isfinite(values), values, np.inf)))
-    return place if isfinite(values[place]) else None

@@ -135,7 +135,8 @@ def norm_panels(
 def metric_panels(cases: Sequence[Case], name: str) -> list[Panel]:
     """Every metric over the number ``name``, doubly logarithmic: a curve for each other choice.
 
-    None if there are fewer than three points on every curve, or more curves than stay apart.
+    There are none if every curve has fewer than three points, or if there are more curves than
+    stay apart.
     """
     groups = {
         label: members

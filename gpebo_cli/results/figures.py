@@ -20,10 +20,10 @@ from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.comparison import norm_panels
-from gpebo_cli.results.finished import ErrorCurves, largest
+from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
-from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset
+from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset, unit_of
 from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def fit(result: RunResult) -> list[Panel]:
     s, labels = result.signals, result.system.labels
     panels = []
     for i, name in enumerate(result.system.outputs):
-        unit, text = _unit(result, name), typeset(name, labels)
+        unit, text = unit_of(name, result.system.units), typeset(name, labels)
         measured, fitted = s.outputs[:, i], found.outputs[:, i]
         curves = (
             Curve(s.t, measured, f"{name} measured", style.MEASURED, f"{text} measured"),
@@ -324,15 +324,12 @@ def _of_states(
     return _of_estimates(of_part)
 
 
-def _unit(result: RunResult, name: str) -> str:
-    units = result.system.units
-    return units.get(name) or units.get(name.removeprefix(_INITIAL), "")
-
-
 def _panel(result: RunResult, name: str, curves: tuple[Curve, ...], **more: Any) -> Panel:
     """The panel of one quantity, called as the plant's author calls it."""
-    text = typeset(name, result.system.labels)
-    return Panel(name, curves, _unit(result, name), text, **more)
+    system = result.system
+    return Panel(
+        name, curves, unit_of(name, system.units), typeset(name, system.labels), **more
+    )
 
 
 def _by_unit(
@@ -360,11 +357,7 @@ def _by_unit(
 def truth_at(result: RunResult, t: Array) -> Array:
     """True states (M, n) at the times t (M,) of the estimates, which are some of the output's."""
     signals = result.signals
-    if len(t) == len(signals.t):
-        return signals.states
-    # The middle between two neighbours: rounding of a time does not choose another row.
-    nearest = np.searchsorted(0.5 * (signals.t[1:] + signals.t[:-1]), t)
-    return np.asarray(signals.states[nearest])
+    return np.asarray(signals.states[rows_at(signals.t, t)])
 
 
 def _known(result: RunResult) -> list[int]:
@@ -386,12 +379,11 @@ def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:
 def _varying_gain(estimation: EstimationResult) -> str | None:
     """The gain that alone tells the cases apart, if there are enough of them to draw a curve."""
     distinct = {name: np.unique(values) for name, values in estimation.gains.items()}
-    varying = [name for name, found in distinct.items() if len(found) > 1]
+    varying = [(name, found) for name, found in distinct.items() if len(found) > 1]
     if len(varying) != 1:
         return None
-    found = distinct[varying[0]]
-    usable = len(found) >= MIN_GAINS and bool(np.isfinite(found).all() and found[0] > 0.0)
-    return varying[0] if usable else None
+    ((name, found),) = varying
+    return name if len(found) >= MIN_GAINS and np.isfinite(found).all() and found[0] > 0 else None
 
 
 def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
@@ -544,9 +536,9 @@ def _error(
         up, down = 2 * deviation, -2 * deviation if signed else None
         label, text = ("± 2σ", r"$\pm\,2\sigma$") if signed else ("2σ", r"$2\sigma$")
         curves = (*curves, Curve(estimation.t, up, label, style.SPREAD, text, down_to=down))
-    labels = result.system.labels
-    return Panel(f"error of {name}", curves, _unit(result, name),
-                 error_of(name, labels, signed=signed), log=not signed, size=size)
+    system = result.system
+    return Panel(f"error of {name}", curves, unit_of(name, system.units),
+                 error_of(name, system.labels, signed=signed), log=not signed, size=size)
 
 
 # In the paper x_a and x_b are Figs. 4 and 5, their errors Figs. 7 and 8.

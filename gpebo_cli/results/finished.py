@@ -17,7 +17,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import is_metric
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.reading import read_bytes, strict_json
 from gpebo_cli.results.sweep_folder import PLAN, JobRecord, read_plan, read_records
 from gpebo_cli.schema import shown
@@ -64,6 +64,11 @@ class ErrorCurves:
 def largest(values: Array) -> float:
     """The largest norm over time of values (N, c)."""
     return float(np.linalg.norm(values, axis=1).max(initial=0.0))
+
+
+def rows_at(times: Array, t: Array) -> IntArray:
+    """Which of the times (N,) those of estimates t (M,) are, whatever the last digits say."""
+    return np.searchsorted(0.5 * (times[1:] + times[:-1]), t)
 
 
 @dataclass(frozen=True)
@@ -182,7 +187,6 @@ def _read_errors(folder: Path) -> Callable[[int], ErrorCurves]:
     path = folder / "estimates.csv"
     everything = read_columns(path, "case", "t", present=[f"{name}_hat" for name in known])
     signals = read_columns(folder / "signals.csv", "t")
-    middles = 0.5 * (signals["t"][1:] + signals["t"][:-1])
 
     def of_case(number: int) -> ErrorCurves:
         """Its error norms (GpeboError: there is no such case)."""
@@ -190,18 +194,18 @@ def _read_errors(folder: Path) -> Callable[[int], ErrorCurves]:
         if not rows.any():
             raise GpeboError(f"{path}: there is no case {number}")
         columns = {name: column[rows] for name, column in everything.items()}
-        nearest = np.searchsorted(middles, columns["t"])  # they are some of the signals' times
+        at = rows_at(signals["t"], columns["t"])
         hats = [name.removesuffix("_hat") for name in columns if name.endswith("_hat")]
 
         def table(found: Iterable[Array]) -> Array:
-            return np.array([*found]).reshape(-1, len(nearest)).T
+            return np.array([*found]).reshape(-1, len(at)).T
 
         # Parameters stand first; a state may have the name of one.
         states = [
             s for s in hats[len(truth) :]
             if s in signals and not np.isnan(columns[f"{s}_hat"]).all()
         ]
-        x = table(signals[name][nearest] for name in states)
+        x = table(signals[name][at] for name in states)
         of_eta = (columns[f"{k}_hat"] - columns.get(f"{k}_true", v) for k, v in known.items())
         return ErrorCurves.of(
             columns["t"], table(of_eta), table(columns[f"{s}_hat"] for s in states) - x,

@@ -342,9 +342,8 @@ def _fill(axes: Axes, panel: Panel, height: float) -> None:
 def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
     """Scale, limits, ticks and name of the horizontal axis."""
     axis = panels[0].axis
-    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves if curve.x.size]
-    values = np.concatenate(ends or [np.ones(1)])
-    low, high = float(values.min()), float(values.max())
+    ends = [curve.x[[0, -1]] for panel in panels for curve in panel.curves]
+    low, high = float(np.min(ends)), float(np.max(ends))
     if not high > low:
         high = low * 10.0 if axis.log else low + 1.0
     if axis.log:
@@ -365,7 +364,7 @@ def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
 def _ends(panel: Panel, low: float, high: float) -> tuple[float, float]:
     """The smallest and the largest value that is drawn; ``low`` and ``high`` if nothing is."""
     bands = [] if panel.log else [c.down_to for c in panel.curves if c.down_to is not None]
-    values = np.concatenate([*(drawn(panel, c) for c in panel.curves), *bands, [np.nan]])
+    values = np.concatenate([*(drawn(panel, c) for c in panel.curves), *bands])
     values = values[np.isfinite(values)]
     return (float(values.min()), float(values.max())) if values.size else (low, high)
 

@@ -20,6 +20,7 @@ from gpebo_cli.experiment.result import (
 )
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.results.provenance import Provenance
+from gpebo_cli.results.symbols import unit_of
 from gpebo_cli.schema import plain
 
 MAX_LISTED_CASES = 100  # beyond, cases.csv is the place to look and the summary gives ranges
@@ -154,13 +155,12 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
     estimation = result.estimation
     if estimation is None:
         return {}
-    signals, units = result.signals, result.system.units
-    nothing = np.full(len(result.system.states), np.nan)
-    last = signals.states[-1] if len(signals.states) else nothing
+    units = result.system.units
     kinds = (
         (estimation.names, estimation.parameters, estimation.parameters_std,
          estimation.true_parameters[-1]),
-        (result.system.states, estimation.states, estimation.states_std, last),
+        (result.system.states, estimation.states, estimation.states_std,
+         result.signals.states[-1]),
     )
     out: dict[str, dict[str, Any]] = {}
     for names, values, deviations, truth in kinds:
@@ -168,7 +168,7 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
             out.setdefault(name, {
                 "value": values[case, -1, i],
                 "std": None if deviations is None else deviations[case, -1, i],
-                "unit": units.get(name.removeprefix("e0_")),
+                "unit": unit_of(name, units) or None,
                 "true": truth[i],
             })
     return out

@@ -23,6 +23,11 @@ def with_unit(name: str, unit: str, between: str = " ") -> str:
     return f"{name}{between}({unit.replace('*', '·')})" if unit else name
 
 
+def unit_of(name: str, units: Mapping[str, str]) -> str:
+    """Unit of a quantity, empty if unknown: ``e0_<state>`` has that of the state."""
+    return units.get(name) or units.get(name.removeprefix("e0_"), "")
+
+
 def power_of_ten(exponent: int) -> str:
     """``10⁻³`` in Unicode."""
     return "10" + str(exponent).translate(_SUPERSCRIPT)

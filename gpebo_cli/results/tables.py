@@ -185,11 +185,9 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
     for case, values in enumerate(estimation.cases):
         own = [cell(values.get(gain)) for gain in names]
         for i, name in enumerate(noise.names):
-            numbers = (noise.truth[i], noise.bias[case, i], noise.deviation[case, i],
-                       noise.rms[case, i])
-            rows.append(
-                [str(case), *own, name, *(f"{x:.17g}" for x in numbers), str(noise.seeds)]
-            )
+            errors = (each[case, i] for each in (noise.bias, noise.deviation, noise.rms))
+            numbers = map(cell, (noise.truth[i], *errors))
+            rows.append([str(case), *own, name, *numbers, str(noise.seeds)])
     write_text(path, csv_text(rows))
 
 
