@@ -58,11 +58,11 @@ class FunctionCoefficients:
         self, t: Array, order: int, inside: Array | None = None, _moved: object = None  # noqa: ARG002
     ) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        if self.signals:
+            return entries_of(self.taylor(t, order), self.constant)
         values: dict[str, Array] = {}
         places: dict[str, Places] = {}
         for name in MATRIX_NAMES:
-            if name in self.signals:
-                return entries_of(self.taylor(t, order), self.constant)
             found = self._values(name, t[:1] if name in self.fixed else t, order, None)
             if name in self.places:
                 values[name], places[name] = found, self.places[name]
@@ -189,7 +189,7 @@ class FunctionCoefficients:
             for coefficient in signals[-2::-1]:
                 there = there * away + coefficient
             arguments = [there[:, : self.shapes["u"][0]], there[:, self.shapes["u"][0] :]]
-        t = t + away[:, 0] if np.iscomplexobj(away) else t
+        t = t + away[:, 0]
         try:
             value = function(t, *arguments[: _arguments(function) - 1])
             value = np.asarray(self._picked(name, value) if name in self.places else value)
@@ -216,10 +216,10 @@ class FunctionCoefficients:
 class Names:
     """Names of a plant given by functions; by default x1 …, u1 …, theta1 …, y1 …"""
 
-    states: Sequence[str] = field(default_factory=tuple)
-    inputs: Sequence[str] = field(default_factory=tuple)
-    unknowns: Sequence[str] = field(default_factory=tuple)
-    outputs: Sequence[str] = field(default_factory=tuple)
+    states: Sequence[str] = ()
+    inputs: Sequence[str] = ()
+    unknowns: Sequence[str] = ()
+    outputs: Sequence[str] = ()
 
 
 def system_from_functions(
