@@ -93,7 +93,7 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
         ConfigError: a discrete-time model, or one without A.
     """
     dt = getattr(system, "dt", None)
-    if dt not in (None, 0, 0.0):
+    if dt not in (None, 0):
         raise ConfigError(
             f"plant {name}: the model is in discrete time (dt = {dt}), and gpebo's plants are "
             "differential equations; convert it to continuous time first"
@@ -102,11 +102,10 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
         kind = type(system).__name__
         raise ConfigError(f"plant {name}: {kind} has no A; give a state-space model")
     matrices = {key: getattr(system, key, None) for key in _NAMES}
-    kinds = (("states", "state_labels"), ("inputs", "input_labels"), ("outputs", "output_labels"))
-    for option, attribute in kinds:
-        labels = getattr(system, attribute, None)
-        if labels is not None and option not in options:
-            options[option] = [_identifier(str(label)) for label in labels]
+    for kind in ("state", "input", "output"):
+        labels = getattr(system, f"{kind}_labels", None)
+        if labels is not None:
+            options.setdefault(f"{kind}s", [_identifier(str(label)) for label in labels])
     return from_matrices(matrices, name, **options)
 
 

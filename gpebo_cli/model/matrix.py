@@ -101,7 +101,7 @@ def matrix(
 def per_row(
     plant: str, key: str, value: object, rows: Side, must: str, noun: str
 ) -> list[object]:
-    """A list with as many items as there are rows."""
+    """The items of a list, as many as there are rows (ConfigError: it is none, or has others)."""
     items = items_of(value)
     if items is None:
         raise ConfigError(f"{plant}: {key} must {must}, not {brief(value)}")

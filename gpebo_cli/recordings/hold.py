@@ -18,6 +18,7 @@ import numpy as np
 
 from gpebo_cli.errors import printable
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.schema import unknown
@@ -101,11 +102,8 @@ def edges(t: Array, cuts: Array) -> Array:
 
     A cut on a sample is that sample.
     """
-    if len(cuts) == 0 or len(t) < 2:
-        return t
     k = np.clip(np.searchsorted(t, cuts), 1, len(t) - 1)
-    near = np.minimum(cuts - t[k - 1], t[k] - cuts) <= _SMALLEST * (t[k] - t[k - 1])
-    return np.unique(np.concatenate([t, cuts[~near]]))
+    return with_others(t, cuts, _SMALLEST * (t[k] - t[k - 1]))
 
 
 def recording_mesh(
