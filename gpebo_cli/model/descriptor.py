@@ -48,9 +48,8 @@ class Coefficients(NamedTuple):
 
     def along(self, signals: Array) -> Coefficients:
         """These with u as it was measured; signals (J + 1, N, m + r) as for ``taylor``."""
-        orders, times, m = self.u.shape
-        u = np.zeros((orders, times, m))
-        given = signals[:orders, :, :m]
+        u: Array = np.zeros(self.u.shape)
+        given = signals[: len(u), :, : u.shape[2]]
         u[: len(given)] = given
         return self._replace(u=u)
 

@@ -75,7 +75,7 @@ class InputDerivatives:
     exact: bool = True  # whether they are those of the inputs, not of what stands for their samples
 
     @classmethod
-    def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives | None:
+    def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives:
         """Exact ones, of the inputs (m,) that are the plant's own functions of time."""
         source = system.coefficients.of_time
         return cls(known, lambda t, inside, order: source.taylor(t, order, inside).u)
@@ -118,9 +118,9 @@ class EquationForm:
         return cls(system, units, inputs=inputs)
 
     @property
-    def follows_signals(self) -> bool:
-        """Whether matrices depend on what is measured."""
-        return bool(self.system.coefficients.signals)
+    def followed(self) -> frozenset[str]:
+        """Names of the inputs and outputs that matrices depend on."""
+        return frozenset[str]().union(*self.system.coefficients.signals.values())
 
     @property
     def known_term(self) -> bool:
@@ -136,9 +136,8 @@ class EquationForm:
 
     def noise_enters(self, noisy: BoolArray) -> tuple[str, ...]:
         """Which of the ``noisy`` ones of [u; y] (m + r,) have their noise in matrices or slopes."""
-        system, slopes = self.system, (self.system.inputs[j] for j in self.interpolated)
-        names = frozenset(slopes).union(*system.coefficients.signals.values())
-        both = compress((*system.inputs, *system.outputs), noisy)
+        names = self.followed.union(self.system.inputs[j] for j in self.interpolated)
+        both = compress((*self.system.inputs, *self.system.outputs), noisy)
         return tuple(name for name in both if name in names)
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
@@ -205,7 +204,7 @@ class EquationForm:
         self, t: Array, inside: Array, signals: Array | None, order: int
     ) -> Array | None:
         """Taylor coefficients of [u, y] (order + 1, N, m + r), of y and unknown u's values only."""
-        if not self.follows_signals:
+        if not self.followed:
             return None
         if signals is None:
             raise ValueError("the matrices follow signals, and none are given")
@@ -283,9 +282,8 @@ def strangeness_free(
     whole = replace(given, structure=structure, derivatives=tuple(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
     ))
-    followed = frozenset[str]().union(*source.signals.values())
     for j, name in enumerate(system.inputs):
-        if name in followed and structure.mu and (inputs is None or not inputs.known[j]):
+        if name in whole.followed and structure.mu and (inputs is None or not inputs.known[j]):
             raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
     if found is None:
@@ -315,9 +313,8 @@ def _refuse_slopes(
 ) -> None:
     """Refuse hidden constraints that change with the derivatives of an output."""
     system, structure = form.system, form.structure
-    followed = frozenset[str]().union(*system.coefficients.signals.values())
     for j, name in enumerate(system.outputs):
-        if name not in followed or structure is None:
+        if name not in form.followed or structure is None:
             continue
         slopes = np.zeros((structure.mu, 1, system.r))
         size = float(np.abs(signals[:, system.m + j]).max()) or 1.0

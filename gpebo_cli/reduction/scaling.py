@@ -94,9 +94,9 @@ def _scaling(factors: Array, n: int) -> Scaling:
     """From the logarithms of the factors (2 n + 1,)."""
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
-    weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
+    weights = 10.0 ** np.rint((r - r[:1]) / np.log(10.0))
     powers = np.exp2(np.rint(factors / np.log(2.0)))
-    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), np.asarray(weights))
+    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), weights)
 
 
 def units_at(c: Coefficients) -> Units:
