@@ -40,9 +40,9 @@ class Pivots(NamedTuple):
     with X = M[rest, columns] M[rows, columns]⁻¹ costs one LU where an SVD costs thirty.
     """
 
-    rank: int  # r
     rows: IntArray  # (rows,) all of them, the r pivots first
     columns: IntArray  # (columns,) likewise
+    rank: int  # r
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
@@ -87,7 +87,7 @@ def without_equations() -> Structure:
     return Structure(
         mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0, ones), rank_tol=0.0,
         smallest_singular_value=np.inf, time_invariant=True,
-        reference=Pivots(0, none, none, np.zeros((0, 0))), steady=True, dynamics=None,
+        reference=Pivots(none, none, 0, np.zeros((0, 0))), steady=True, dynamics=None,
     )
 
 
@@ -232,7 +232,7 @@ def _in_stages(
     return Structure(
         mu=mu, a=a, d=n - a, scaling=s, rank_tol=rank_tol,
         smallest_singular_value=float(stages.smallest[:, :3].min()), time_invariant=len(t) == 1,
-        reference=Pivots(0, none, none, np.zeros((n, 0))), steady=steady,
+        reference=Pivots(none, none, 0, np.zeros((n, 0))), steady=steady,
         dynamics=None if singular.any() else W1 @ A @ inverse[:, :, : n - a] / s.time,
         stages=ranks,
     )
@@ -327,10 +327,8 @@ def _judged(
     )
     if failure:
         return _Levels(a, smallest, failure)
-    reference = Pivots((mu + 1) * n - a, rows, columns, Z1)
-    bounds, left, dynamics = kernels.structure.bounds(
-        *model, rows, columns, reference.rank, Z1
-    )
+    reference = Pivots(rows, columns, (mu + 1) * n - a, Z1)
+    bounds, left, dynamics = kernels.structure.bounds(*model, *reference)
     finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
     if invariant:
         return _Levels(a, smallest, "", reference, float(smallest.min()), finite)
@@ -486,9 +484,7 @@ def _lines(
     serve as well, where none of them comes near zero.
     """
     model = scaling.rows, scaling.columns, scaling.time, mu + 1
-    bounds, left, _ = kernels.structure.bounds(
-        c.E, c.A, *model, reference.rows, reference.columns, reference.rank, reference.Z1
-    )
+    bounds, left, _ = kernels.structure.bounds(c.E, c.A, *model, *reference)
     lines = bounds.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column]
     sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
     sound &= (left.reshape(-1, _DIP_POINTS) <= RESIDUAL).all(axis=1)
