@@ -57,11 +57,8 @@ def from_matrices(
     sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "C": (r, n), "D": (r, m)}
     for key, matrix in given.items():
         if matrix.shape != sizes[key]:
-            rows, columns = matrix.shape
-            raise ConfigError(
-                f"plant {name}: {key} is {rows} × {columns}; expected {sizes[key][0]} × "
-                f"{sizes[key][1]}"
-            )
+            got, expected = (" × ".join(map(str, size)) for size in (matrix.shape, sizes[key]))
+            raise ConfigError(f"plant {name}: {key} is {got}; expected {expected}")
     draft = PlantDraft(name, title or f"matrices {name}", reference)
     start = np.zeros(n) if initial_state is None else np.asarray(initial_state, dtype=float)
     labels = names_of("states", states, "x", n, name)
@@ -195,7 +192,7 @@ def _modelica(path: Path) -> dict[str, Any]:
 def _bracketed(text: str, where: str) -> np.ndarray[Any, Any]:
     try:
         value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         rows = [row for row in text.strip("[]").split(";") if row.strip()]
         value = [
             [_float(item, where) for item in row.replace(",", " ").split()] for row in rows
