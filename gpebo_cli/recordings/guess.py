@@ -9,7 +9,7 @@ import csv
 import difflib
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isnan, pi
@@ -211,7 +211,7 @@ def _find_signals(
         found.doubts.append(f"no column was found for {signal}: write it to data.columns.{signal}")
     for signal, name in found.columns.items():
         unit = system.units.get(signal, "")
-        for written in _units(name) if signal != TIME and unit else ():
+        for written in _units(name) if unit else ():
             factor = _factor(written, unit)
             if factor is None:
                 found.doubts.append(
@@ -249,11 +249,11 @@ def _factor(written: str, unit: str) -> float | None:
     return None
 
 
-def _prefixed(unit: str) -> list[tuple[float, str]]:
+def _prefixed(unit: str) -> Iterator[tuple[float, str]]:
     """The unit itself, and without the first letter where that may be a prefix."""
-    of_letter = _PREFIXES.get(unit[:1])
-    cut = [] if of_letter is None or unit == "min" else [(of_letter, unit[1:])]
-    return [(1.0, unit), *cut] if unit[1:] else [(1.0, unit)]
+    yield 1.0, unit
+    if unit[:1] in _PREFIXES and unit[1:] and unit != "min":
+        yield _PREFIXES[unit[0]], unit[1:]
 
 
 def _as_usual(unit: str) -> tuple[float, str]:

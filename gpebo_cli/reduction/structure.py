@@ -7,7 +7,7 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -143,19 +143,18 @@ def _analysed(
             more = system.coefficients.taylor(t, mu + 1)
             if _judged(t, more, mu + 1, scaling, rank_tol, invariant).a != levels.a:
                 raise unclear_ranks(system, t, UnclearError(0, rounding=True))
-        lines = partial(
-            _lines, mu=mu, scaling=scaling, rank_tol=rank_tol, a=levels.a,
-            reference=levels.reference,
-        )
-        steady = invariant or _follow_dips(system, t, levels.smallest, mu, rank_tol, lines)
-        if not levels.a and "E" not in system.coefficients.constant:
-            _refuse_crossing(system, t, c.E[0])
-        return Structure(
+        found = Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=levels.reference, steady=steady,
+            reference=levels.reference, steady=True,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
+        if not invariant:
+            steady = _follow_dips(system, t, levels.smallest, mu, rank_tol, partial(_lines, found))
+            found = replace(found, steady=steady)
+        if not levels.a and "E" not in system.coefficients.constant:
+            _refuse_crossing(system, t, c.E[0])
+        return found
     staged = _in_stages(system, t, max_mu, rank_tol)
     if staged is not None:
         return staged
@@ -474,22 +473,21 @@ def _follow_dips(
 _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
-def _lines(
-    _: Array, c: Coefficients, column: IntArray, *, mu: int, scaling: Scaling, rank_tol: float,
-    a: int, reference: Pivots,
-) -> Array:
-    """Columns (D,) of the levels that belong to ``a`` constraints, (D, points).
+def _lines(structure: Structure, _: Array, c: Coefficients, column: IntArray) -> Array:
+    """Columns (D,) of the levels that belong to the constraints there are, (D, points).
 
     The times of c are those of one grid for each, one after the other. Bounds of them from below
     serve as well, where none of them comes near zero.
     """
-    model = scaling.rows, scaling.columns, scaling.time, mu + 1
-    bounds, left, _ = kernels.structure.bounds(c.E, c.A, *model, *reference)
+    s, rank_tol = structure.scaling, structure.rank_tol
+    model = s.rows, s.columns, s.time, structure.mu + 1
+    bounds, left, _ = kernels.structure.bounds(c.E, c.A, *model, *structure.reference)
     lines = bounds.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column]
     sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
     sound &= (left.reshape(-1, _DIP_POINTS) <= RESIDUAL).all(axis=1)
     for i in np.flatnonzero(~sound).tolist():
         some = slice(i * _DIP_POINTS, (i + 1) * _DIP_POINTS)
         E, A = (x if x.shape[1] == 1 else x[:, some] for x in (c.E, c.A))
-        lines[i] = kernels.structure.levels(E, A, *model, rank_tol, a)[1][:, column[i]]
+        levels = kernels.structure.levels(E, A, *model, rank_tol, structure.a)[1]
+        lines[i] = levels[:, column[i]]
     return np.asarray(lines)
