@@ -150,10 +150,14 @@ class DescriptorSystem:
     regression: object = None
 
     @property
+    def followed(self) -> frozenset[str]:
+        """Names of the inputs and outputs that matrices depend on."""
+        return frozenset[str]().union(*self.coefficients.signals.values())
+
+    @property
     def depends_on_outputs(self) -> bool:
         """Whether some matrix depends on an output: the plant is not linear in its state."""
-        depends = self.coefficients.signals.values()
-        return any(not names.isdisjoint(self.outputs) for names in depends)
+        return not self.followed.isdisjoint(self.outputs)
 
     @property
     def theta_varies(self) -> bool:

@@ -118,11 +118,6 @@ class EquationForm:
         return cls(system, units, inputs=inputs)
 
     @property
-    def followed(self) -> frozenset[str]:
-        """Names of the inputs and outputs that matrices depend on."""
-        return frozenset[str]().union(*self.system.coefficients.signals.values())
-
-    @property
     def known_term(self) -> bool:
         """Whether there is a φ."""
         return "phi" not in self.system.coefficients.zero
@@ -136,7 +131,7 @@ class EquationForm:
 
     def noise_enters(self, noisy: BoolArray) -> tuple[str, ...]:
         """Which of the ``noisy`` ones of [u; y] (m + r,) have their noise in matrices or slopes."""
-        names = self.followed.union(self.system.inputs[j] for j in self.interpolated)
+        names = self.system.followed.union(self.system.inputs[j] for j in self.interpolated)
         both = compress((*self.system.inputs, *self.system.outputs), noisy)
         return tuple(name for name in both if name in names)
 
@@ -204,7 +199,7 @@ class EquationForm:
         self, t: Array, inside: Array, signals: Array | None, order: int
     ) -> Array | None:
         """Taylor coefficients of [u, y] (order + 1, N, m + r), of y and unknown u's values only."""
-        if not self.followed:
+        if not self.system.followed:
             return None
         if signals is None:
             raise ValueError("the matrices follow signals, and none are given")
@@ -283,7 +278,7 @@ def strangeness_free(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
     ))
     for j, name in enumerate(system.inputs):
-        if name in whole.followed and structure.mu and (inputs is None or not inputs.known[j]):
+        if name in system.followed and structure.mu and (inputs is None or not inputs.known[j]):
             raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
     if found is None:
@@ -314,7 +309,7 @@ def _refuse_slopes(
     """Refuse hidden constraints that change with the derivatives of an output."""
     system, structure = form.system, form.structure
     for j, name in enumerate(system.outputs):
-        if name not in form.followed or structure is None:
+        if name not in system.followed or structure is None:
             continue
         slopes = np.zeros((structure.mu, 1, system.r))
         size = float(np.abs(signals[:, system.m + j]).max()) or 1.0

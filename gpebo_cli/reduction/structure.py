@@ -303,12 +303,12 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
             narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
             places = (np.arange(_NARROW) + 0.5) / _NARROW
             looks = edges[narrow, None] + steps[narrow, None] * places
-            t = np.unique(np.concatenate([t, looks.ravel()]))
+            t = np.union1d(t, looks)
     if not len(jumps):
         return t
     cuts = np.concatenate([[start], jumps, [stop]])
     middles = 0.5 * (cuts[:-1] + cuts[1:])  # no piece between jumps goes unprobed
-    return np.unique(np.concatenate([t, middles]))
+    return np.union1d(t, middles)
 
 
 def _judged(
