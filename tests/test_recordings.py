@@ -534,6 +534,7 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         ({"scale": {"V": 0.0}}, "data.scale.V must be a finite number other than 0"),
         ({"columns": {"V": "U"}}, "no column U"),
         ({"scale": {"v": 2.0}}, "did you mean V?"),
+        ({"hold": {"v": "zoh"}}, "data.hold.v: plant circuit has no such signal; those are V, y"),
         ({"separator": "ab"}, "data.separator"),
         ({"separator": ".", }, "data.separator"),
     ],

@@ -298,14 +298,10 @@ class _Builder:
                 self.draft.add(matrix, row, self._node[node], sign + text)
 
     def _admittance(
-        self, matrix: str, ends: Sequence[str], text: str, across: Sequence[str] = ()
+        self, matrix: str, ends: Sequence[str], text: str, across: Sequence[str]
     ) -> None:
-        """text · (v_c − v_d) in the balance of node a, and text · (v_d − v_c) in that of b.
-
-        ``across`` are c and d, by default the ``ends`` a and b.
-        """
-        a, b = ends[:2]
-        c, d = across[:2] or (a, b)
+        """text · (v_c − v_d) in the balance of a, its negative in that of b, across c and d."""
+        (a, b), (c, d) = ends[:2], across
         self._between(matrix, self._row.get(a), c, d, text)
         self._between(matrix, self._row.get(b), d, c, text)
 
@@ -330,7 +326,7 @@ class _Builder:
 
     def _stamp_C(self, e: Element) -> None:
         name = self._value(e)
-        self._admittance("E", e.nodes, name)
+        self._admittance("E", e.nodes, name, e.nodes)
         if self._varies(e.value):
             self._admittance("A", e.nodes, f"d({name})", e.nodes[::-1])
 

@@ -83,11 +83,7 @@ def held(t: Array, values: Array, hold: Hold) -> Held:
         spline = CubicSpline(t, values, axis=0)
         return lambda at, _inside: np.asarray(spline(at), dtype=np.float64)
     if hold == "zoh":
-        def last(_at: Array, inside: Array) -> Array:
-            return np.asarray(values[np.searchsorted(t, inside, side="right") - 1])
-
-        return last
-
+        return lambda _at, inside: np.asarray(values[np.searchsorted(t, inside, side="right") - 1])
     slope = np.diff(values, axis=0) / np.diff(t)[:, None]
 
     def line(at: Array, inside: Array) -> Array:
