@@ -20,22 +20,15 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.kernels.arrays import joined
-from gpebo_cli.model.descriptor import (
-    Array,
-    BoolArray,
-    Changed,
-    Coefficients,
-    DescriptorSystem,
-)
+from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.scaling import Units, units_at
-from gpebo_cli.reduction.strangeness_free import reduced
+from gpebo_cli.reduction.strangeness_free import LOOKS, reduced
 from gpebo_cli.reduction.structure import Structure, analyse
 
-_LOOKS = 32  # times at which rounding is looked at
 _AHEAD = np.linspace(0.0, 1.0, 17)  # of what of the plant is looked at before its samples come
 _SEEN = 2  # derivatives at the start by which an entry that is zero there is known
 _MOVED = 1e-8  # of hidden constraints: what derivatives of an output may change by rounding
@@ -226,11 +219,11 @@ def hidden_constraints(
     for i in range(mu + 1):
         for k in range(i + 1):
             blocks[i, :, :, k] = c.B[i - k]
-    parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[: mu + 1, :, :, None], c.F[: mu + 1]
+    parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[..., None], c.F
     g = np.concatenate(
         [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
     )
-    every = max(1, len(t) // _LOOKS)
+    every = max(1, len(t) // LOOKS)
     A2, f2, made_of, _ = reduced(system, structure, E, A, g, t, every)
     terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
     A2 = A2 * (units / s.columns)

@@ -24,7 +24,7 @@ from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks, wh
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _EPS = float(np.finfo(float).eps)
 _MOVED = ("E", "A", "B", "F", "u", "theta", "phi")
-_LOOKS = 32  # times at which the sensitivity to rounding is looked at
+LOOKS = 32  # times at which the sensitivity to rounding is looked at
 
 
 def forcing(c: Coefficients) -> Array:
@@ -83,7 +83,7 @@ def strangeness_free_form(
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
-    every = max(1, len(t) // _LOOKS)
+    every = max(1, len(t) // LOOKS)
     found = None if structure.stages else kernels.structure.eliminated(
         E, A, *model, c.B, F, c.u, theta, *structure.reference, every, MAX_GROWTH, RESIDUAL
     )
