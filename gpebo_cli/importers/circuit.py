@@ -26,7 +26,9 @@ _NO_NAMES = {*RESERVED, *keyword.kwlist}
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
 _QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
 _ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
-_TERM = re.compile(r"([+-]?)(?:([\d.eE]+(?:[eE][+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE)
+_TERM = re.compile(
+    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -239,6 +241,8 @@ class _Builder:
             (column, sign * float(match[2] or 1.0) * (-1.0 if match[1] == "-" else 1.0))
             for match in terms for column, sign in self._quantity(match[3])
         ]
+        if not parts:
+            raise ConfigError(f"{self.file}: cannot measure {shown(text)}: ground has no voltage")
         units = {"V" if match[3][0].lower() == "v" else "A" for match in terms}
         name = "".join(label).strip() or ("y" if len(terms) > 1 else f"y_{parts[0][0]}")
         self.draft.outputs[self._claim(name, f"{name}_")] = units.pop() if len(units) == 1 else ""
