@@ -249,7 +249,7 @@ def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
 
 def named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
     """What a key of a file has by name, in its order (ConfigError: no mapping, or no names)."""
-    if value is None or value == []:
+    if is_empty(value):
         return {}
     if not isinstance(value, Mapping):
         raise ConfigError(
