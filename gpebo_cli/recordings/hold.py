@@ -98,6 +98,8 @@ def edges(t: Array, cuts: Array) -> Array:
 
     A cut on a sample is that sample.
     """
+    if not len(cuts):
+        return t
     k = np.clip(np.searchsorted(t, cuts), 1, len(t) - 1)
     return with_others(t, cuts, _SMALLEST * (t[k] - t[k - 1]))
 

@@ -441,6 +441,8 @@ def _follow_dips(
     probe may by luck be nearer to the zero than the times of the first round.
     """
     steady, dips = _dips(smallest)
+    if not dips:
+        return steady
     names = ("derivative array", "constraints", "differential part", "constraints")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
