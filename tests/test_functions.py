@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plants import shipped
+from scipy import sparse
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -103,6 +104,11 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
     ("changes", "message"),
     [
         ({"E": np.eye(5)}, r"E has shape \(5, 5\), expected \(6, 6\)"),
+        ({"E": 1j * np.eye(6)}, "E is not an array of real numbers"),
+        ({"E": [[1.0], [1.0, 2.0]]}, "E is not an array of real numbers"),
+        ({"E": lambda t: [sparse.eye(7)] * len(t)}, r"E returned a matrix \(7, 7\), expected \(6"),
+        ({"initial_state": [np.zeros(6)]}, r"initial_state has shape \(1, 6\), expected \(6,\)"),
+        ({"theta": 1.0}, r"theta has shape \(\), expected \(1,\)"),
         ({"u": None}, "B and u go together"),
         ({"names": Names(states=("a", "b"))}, "2 names of states for 6 of them"),
         ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(3, 5, 6\)"),

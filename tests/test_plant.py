@@ -287,6 +287,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "unknown and initial error": (lambda: mine(unknowns={"e0_x1": 1}), "the unknown e0_x1 has"),
     "inputs is a list": (lambda: mine(inputs=["V", "I"]), "inputs must map names to values"),
     "unknowns is a list": (lambda: mine(unknowns=["a"]), "unknowns must map names to values"),
+    "inputs is an array": (lambda: mine(inputs=np.eye(2)), "inputs must map names to values"),
     "outputs is a mapping": (lambda: mine(outputs={"y": 1}), "outputs must be a list"),
     "input is a boolean": (lambda: mine(inputs={"V": True, "I": 0}), "inputs.V is the boolean"),
     "input name is a boolean": (lambda: mine(inputs={False: 1, "I": 0}), "boolean false as a name"),

@@ -534,6 +534,7 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         ({"scale": {"V": 0.0}}, "data.scale.V must be a finite number other than 0"),
         ({"columns": {"V": "U"}}, "no column U"),
         ({"scale": {"v": 2.0}}, "did you mean V?"),
+        ({"hold": {"v": "zoh"}}, "data.hold.v: plant circuit has no such signal; those are V, y"),
         ({"separator": "ab"}, "data.separator"),
         ({"separator": ".", }, "data.separator"),
     ],
@@ -768,9 +769,19 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert found.lacking == ["V", "y"]
     assert any("no column was found for V" in doubt for doubt in found.doubts)
-    path.write_bytes(b"t,V,y\n0,1,\xff\n")
-    with refused("lab.csv, line 2: not UTF-8 text"):
-        guess(str(path), shipped("circuit"))
+    for content, message in (
+        (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
+        (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
+    ):
+        path.write_bytes(content)
+        with refused(message):
+            guess(str(path), shipped("circuit"))
+
+
+def test_a_line_is_looked_at_that_is_longer_than_a_cell(tmp_path):
+    wide = [["t", "V", "y", *(f"x{k}" for k in range(30_000))], ["0"] * 30_003, ["1"] * 30_003]
+    (tmp_path / "lab.csv").write_text("\n".join(map(";".join, wide)))
+    assert guess(str(tmp_path / "lab.csv"), shipped("circuit")).separator == ";"
 
 
 def test_numbers_that_stand_for_gaps_are_said(tmp_path):

@@ -148,7 +148,6 @@ def _explained(
     correlation = np.array([
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
-    names = frozenset[str]().union(*system.coefficients.signals.values())
     return replace(
         fit, far=[
             (name, int(own.sum()), float(t[::stride][np.argmax(own)]))
@@ -161,8 +160,8 @@ def _explained(
         ],
         correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
         follows=_follows(residual[:, seen], u[::stride]),
-        in_matrices=tuple(
-            name for name in system.outputs if name in names and observation.errors is None
+        in_matrices=() if observation.errors is not None else tuple(
+            name for name in system.outputs if name in system.followed
         ),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

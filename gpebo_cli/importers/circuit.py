@@ -9,7 +9,7 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import chain, count
 from typing import Any
 
@@ -26,7 +26,9 @@ _NO_NAMES = {*RESERVED, *keyword.kwlist}
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
 _QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
 _ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
-_TERM = re.compile(r"([+-]?)(?:([\d.eE]+(?:[eE][+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE)
+_TERM = re.compile(
+    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -102,13 +104,11 @@ def examine(netlist: Netlist, file: str) -> Topology:
     # What is controlled may still be determined by what controls it: the plant's analysis decides.
     fixed = DisjointSet(nodes)  # by sources alone: their loops have no unique current
     for e in branches:
-        if e.kind == "V":
-            a, b = e.nodes
-            if not fixed.merge(a, b):
-                raise e.place.error(
-                    f"{e.name} closes a loop of voltage sources, or is shorted; its current would "
-                    "be anything"
-                )
+        if e.kind == "V" and not fixed.merge(*e.nodes):
+            raise e.place.error(
+                f"{e.name} closes a loop of voltage sources, or is shorted; its current would be "
+                "anything"
+            )
     carried = joined("I")
     for e in branches:
         if e.kind == "I" and not carried.connected(*e.nodes):
@@ -177,10 +177,10 @@ class _Builder:
         elements = sorted(
             netlist.elements, key=lambda e: (_ORDER.index(e.kind), _natural(e.name))
         )
-        self.netlist = netlist = replace(netlist, elements=tuple(elements))
+        self.netlist = netlist
+        self.elements = {e.name.lower(): e for e in elements}
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
-        self.elements = {e.name.lower(): e for e in netlist.elements}
         self._taken: set[str] = set()
         self._turned: set[int] = set()  # rows that are multiplied by −1
         self._called: dict[str, str] = {}  # parameter of an element's value, by lower-case name
@@ -199,20 +199,18 @@ class _Builder:
         draft = self.draft
         for key, value in self.netlist.parameters.items():
             draft.parameters[self._claim(key, key)] = value
-        nodes = {node for e in self.netlist.elements for node in e.nodes} - {GROUND}
+        nodes = {node for e in self.elements.values() for node in e.nodes} - {GROUND}
         for node in sorted(nodes, key=_natural):
             plain = node.isidentifier() and node not in _NO_NAMES
             label = self._claim(node if plain else f"v{node}", f"v_{node}")
             self._node[node] = label
             self._row[node] = draft.equation(f"currents at node {node}")
             draft.states[label] = (self.netlist.initial.get(f"v({node})", 0.0), "V")
-        for e in self.netlist.elements:
-            wanted = e.name.lower() in self._wanted
-            if e.kind in _WITH_CURRENT or (e.kind in "RS" and wanted):
-                label = self._claim(f"i{e.name.lower()}", f"i_{e.name}")
-                self._current[e.name.lower()] = label
+        for name, e in self.elements.items():
+            if e.kind in _WITH_CURRENT or (e.kind in "RS" and name in self._wanted):
+                label = self._current[name] = self._claim(f"i{name}", f"i_{e.name}")
                 start = e.initial if e.kind == "L" else None
-                given = self.netlist.initial.get(f"i({e.name.lower()})", 0.0)
+                given = self.netlist.initial.get(f"i({name})", 0.0)
                 draft.states[label] = (given if start is None else start, "A")
         known = [f"v({node})" for node in self._node] + [f"i({name})" for name in self._current]
         for quantity in self.netlist.initial:
@@ -221,7 +219,7 @@ class _Builder:
                     f"{self.file}: .ic {quantity} is neither the voltage of a node nor a current "
                     "that is a state" + nearest(quantity, known)
                 )
-        for e in self.netlist.elements:
+        for e in self.elements.values():
             getattr(self, f"_stamp_{e.kind}")(e)
         draft.negate(self._turned)  # an algebraic equation begins with a minus, as balances do
         self._start_of_capacitors()
@@ -243,6 +241,8 @@ class _Builder:
             (column, sign * float(match[2] or 1.0) * (-1.0 if match[1] == "-" else 1.0))
             for match in terms for column, sign in self._quantity(match[3])
         ]
+        if not parts:
+            raise ConfigError(f"{self.file}: cannot measure {shown(text)}: ground has no voltage")
         units = {"V" if match[3][0].lower() == "v" else "A" for match in terms}
         name = "".join(label).strip() or ("y" if len(terms) > 1 else f"y_{parts[0][0]}")
         self.draft.outputs[self._claim(name, f"{name}_")] = units.pop() if len(units) == 1 else ""
@@ -302,14 +302,10 @@ class _Builder:
                 self.draft.add(matrix, row, self._node[node], sign + text)
 
     def _admittance(
-        self, matrix: str, ends: Sequence[str], text: str, across: Sequence[str] = ()
+        self, matrix: str, ends: Sequence[str], text: str, across: Sequence[str]
     ) -> None:
-        """text · (v_c − v_d) in the balance of node a, and text · (v_d − v_c) in that of b.
-
-        ``across`` are c and d, by default the ``ends`` a and b.
-        """
-        a, b = ends[:2]
-        c, d = across[:2] or (a, b)
+        """text · (v_c − v_d) in the balance of a, its negative in that of b, across c and d."""
+        (a, b), (c, d) = ends[:2], across
         self._between(matrix, self._row.get(a), c, d, text)
         self._between(matrix, self._row.get(b), d, c, text)
 
@@ -334,7 +330,7 @@ class _Builder:
 
     def _stamp_C(self, e: Element) -> None:
         name = self._value(e)
-        self._admittance("E", e.nodes, name)
+        self._admittance("E", e.nodes, name, e.nodes)
         if self._varies(e.value):
             self._admittance("A", e.nodes, f"d({name})", e.nodes[::-1])
 
@@ -417,7 +413,7 @@ class _Builder:
         """Node voltages from ``ic=`` of capacitors: those at ground first, then along chains."""
         voltages = {node: self.netlist.initial.get(f"v({node})") for node in self._node}
         known = {GROUND: 0.0} | {node: v for node, v in voltages.items() if v is not None}
-        given = [(e.nodes, e.initial) for e in self.netlist.elements
+        given = [(e.nodes, e.initial) for e in self.elements.values()
                  if e.kind == "C" and e.initial is not None]
         before = 0
         while len(known) > before:
@@ -435,7 +431,7 @@ class _Builder:
         """Currents of resistors that nothing is said of, from the voltages that they start with."""
         states, parameters = self.draft.states, self.draft.parameters
         found = [
-            e for e in self.netlist.elements if e.kind in "RS" and e.name.lower() in self._current
+            e for e in self.elements.values() if e.kind in "RS" and e.name.lower() in self._current
             and f"i({e.name.lower()})" not in self.netlist.initial
         ]
         if not found:

@@ -46,7 +46,7 @@ class PlantDraft:
     outputs: dict[str, str] = field(default_factory=dict)  # unit
     rows: list[str] = field(default_factory=list)  # what each equation says
     _terms: dict[str, dict[tuple[int, str], list[Entry]]] = field(
-        default_factory=lambda: {name: {} for name in "EABFCDH"}
+        default_factory=lambda: {name: {} for name in MATRICES}
     )
 
     def equation(self, says: str) -> int:
@@ -63,7 +63,7 @@ class PlantDraft:
         sign: int = 1,
     ) -> None:
         """Add what is not zero of ± ``values`` in rows from the first on, and columns or all."""
-        columns = columns or list(self._columns(matrix))
+        columns = columns or self._columns(matrix)
         for i, j, value in _nonzero(values):
             text = isinstance(value, str) and sign < 0
             self.add(matrix, first + i, columns[j], f"-({value})" if text else sign * value)
@@ -139,16 +139,13 @@ class PlantDraft:
             "A": self._grid("A"),
         }
         for matrix in "BFCDH":
-            size = self._height(matrix) * len(list(self._columns(matrix)))
+            size = self._height(matrix) * len(self._columns(matrix))
             if self._terms[matrix] or (matrix in "BFC" and size):
                 text[matrix] = self._grid(matrix)
         text["initial_state"] = {name: value for name, (value, _) in self.states.items()}
-        text["units"] = {
-            name: unit
-            for group in (self.states, self.inputs, self.unknowns)
-            for name, (_, unit) in group.items()
-            if unit
-        } | {name: unit for name, unit in self.outputs.items() if unit}
+        valued = {**self.states, **self.inputs, **self.unknowns}
+        units = {name: unit for name, (_, unit) in valued.items()} | self.outputs
+        text["units"] = {name: unit for name, unit in units.items() if unit}
         return {
             key: value for key, value in text.items()
             if value is not None and (not isinstance(value, dict | list) or value)
@@ -161,13 +158,14 @@ class PlantDraft:
         """
         plant, comments = self.mapping(), self.comments
         if archive:
-            plant = {key: value for key, value in plant.items() if key not in self.archived()}
+            apart = self.archived()
+            plant = {key: value for key, value in plant.items() if key not in apart}
             plant["parameters"] = self._used(plant)
             plant[ARCHIVE] = archive
             comments = [*comments, *(f"row {i}: {says}" for i, says in enumerate(self.rows, 1))]
         lines = [f"# {line}".rstrip() for line in comments]
         for key, value in plant.items():
-            if key in ("E", "A", "B", "F", "C", "D", "H"):
+            if key in self._terms:
                 lines += ["", *self._matrix_lines(key, value)]
             elif isinstance(value, dict) and key in ("parameters", "inputs", "unknowns"):
                 lines += ["", f"{key}:"]
@@ -213,16 +211,15 @@ class PlantDraft:
                 words.update(re.findall(r"[A-Za-z_]\w*", str(value)))
         return dict(reversed(used.items()))
 
-    def _columns(self, matrix: str) -> Iterable[str]:
-        if matrix in "BD":
-            return self.inputs
-        return self.unknowns if matrix in "FH" else self.states
+    def _columns(self, matrix: str) -> list[str]:
+        of = {"B": self.inputs, "D": self.inputs, "F": self.unknowns, "H": self.unknowns}
+        return list(of.get(matrix, self.states))
 
     def _height(self, matrix: str) -> int:
         return len(self.outputs) if matrix in "CDH" else len(self.rows)
 
     def _grid(self, matrix: str) -> object:
-        terms, columns = self._terms[matrix], list(self._columns(matrix))
+        terms, columns = self._terms[matrix], self._columns(matrix)
         if len(self.states) > MAX_IN_TEXT and not any(
             isinstance(term, str) for given in terms.values() for term in given
         ):

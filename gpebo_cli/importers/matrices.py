@@ -57,11 +57,8 @@ def from_matrices(
     sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "C": (r, n), "D": (r, m)}
     for key, matrix in given.items():
         if matrix.shape != sizes[key]:
-            rows, columns = matrix.shape
-            raise ConfigError(
-                f"plant {name}: {key} is {rows} × {columns}; expected {sizes[key][0]} × "
-                f"{sizes[key][1]}"
-            )
+            got, expected = (" × ".join(map(str, size)) for size in (matrix.shape, sizes[key]))
+            raise ConfigError(f"plant {name}: {key} is {got}; expected {expected}")
     draft = PlantDraft(name, title or f"matrices {name}", reference)
     start = np.zeros(n) if initial_state is None else np.asarray(initial_state, dtype=float)
     labels = names_of("states", states, "x", n, name)
@@ -93,7 +90,7 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
         ConfigError: a discrete-time model, or one without A.
     """
     dt = getattr(system, "dt", None)
-    if dt not in (None, 0, 0.0):
+    if dt not in (None, 0):
         raise ConfigError(
             f"plant {name}: the model is in discrete time (dt = {dt}), and gpebo's plants are "
             "differential equations; convert it to continuous time first"
@@ -102,11 +99,10 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
         kind = type(system).__name__
         raise ConfigError(f"plant {name}: {kind} has no A; give a state-space model")
     matrices = {key: getattr(system, key, None) for key in _NAMES}
-    kinds = (("states", "state_labels"), ("inputs", "input_labels"), ("outputs", "output_labels"))
-    for option, attribute in kinds:
-        labels = getattr(system, attribute, None)
-        if labels is not None and option not in options:
-            options[option] = [_identifier(str(label)) for label in labels]
+    for kind in ("state", "input", "output"):
+        labels = getattr(system, f"{kind}_labels", None)
+        if labels is not None:
+            options.setdefault(f"{kind}s", [_identifier(str(label)) for label in labels])
     return from_matrices(matrices, name, **options)
 
 
@@ -196,7 +192,7 @@ def _modelica(path: Path) -> dict[str, Any]:
 def _bracketed(text: str, where: str) -> np.ndarray[Any, Any]:
     try:
         value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
         rows = [row for row in text.strip("[]").split(";") if row.strip()]
         value = [
             [_float(item, where) for item in row.replace(",", " ").split()] for row in rows

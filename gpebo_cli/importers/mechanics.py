@@ -82,11 +82,12 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         comments=["M q'' + D q' + K q = G' lambda + B u + F theta,  G q = r"],
         parameters=dict(given.parameters),
     )
-    start = [0.0] * (2 * k + c)
-    for first, key in enumerate(("initial_positions", "initial_velocities")):
-        start[first * k : (first + 1) * k] = per_name(
+    start: list[float] = []
+    for key in ("initial_positions", "initial_velocities"):
+        start += per_name(
             getattr(given, key), positions, "position", f"{where}: {key}", "finite", absent=0.0
         ).tolist()
+    start += [0.0] * c
     for state, value in zip([*positions, *velocities, *forces], start, strict=True):
         draft.states[state] = (value, given.units.get(state, ""))
     for group, values in ((draft.inputs, given.inputs), (draft.unknowns, given.unknowns)):

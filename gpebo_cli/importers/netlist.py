@@ -321,13 +321,13 @@ class _Reader:
     def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:
         place = scope.place
         plain = [word for word in plain if word.lower() != "params:"]
-        if len(plain) < 2 or plain[-1].lower() not in self.blocks:
-            what = shown(plain[-1]) if len(plain) > 1 else "nothing"
+        last = plain[-1] if len(plain) > 1 else ""
+        block = self.blocks.get(last.lower())
+        if block is None:
             raise place.error(
-                f"{plain[0]} ends with the name of a subcircuit, and {what} is none"
-                + (nearest(plain[-1].lower(), self.blocks) if len(plain) > 1 else "")
+                f"{plain[0]} ends with the name of a subcircuit, and "
+                f"{shown(last) if last else 'nothing'} is none" + nearest(last.lower(), self.blocks)
             )
-        block = self.blocks[plain[-1].lower()]
         if scope.depth >= MAX_DEPTH:
             raise place.error(f"subcircuits are nested more than {MAX_DEPTH} deep ({block.name})")
         ends = plain[1:-1]

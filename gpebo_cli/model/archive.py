@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.model.matrix import is_empty
 from gpebo_cli.reading import beside, open_regular
 from gpebo_cli.schema import shown
 
@@ -48,10 +49,10 @@ def with_archive(mapping: Mapping[str, object], source: str, where: str) -> Mapp
         raise ConfigError(f"{where}: {ARCHIVE} is the name of an .npz file, not {shown(file)}")
     path = beside(file, source, f"{where}: {ARCHIVE}")
     found = read_archive(path)
-    both = [key for key in found if mapping.get(key)]
+    both = [key for key in found if not is_empty(mapping.get(key))]
     if both:
         raise ConfigError(f"{where}: {both[0]} stands in the plant and in {path}; leave one out")
-    return {**{key: value for key, value in mapping.items() if key != ARCHIVE}, **found}
+    return {**mapping, **found}
 
 
 def read_archive(path: str) -> dict[str, Any]:

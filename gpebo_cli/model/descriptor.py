@@ -48,9 +48,8 @@ class Coefficients(NamedTuple):
 
     def along(self, signals: Array) -> Coefficients:
         """These with u as it was measured; signals (J + 1, N, m + r) as for ``taylor``."""
-        orders, times, m = self.u.shape
-        u = np.zeros((orders, times, m))
-        given = signals[:orders, :, :m]
+        u: Array = np.zeros(self.u.shape)
+        given = signals[: len(u), :, : u.shape[2]]
         u[: len(given)] = given
         return self._replace(u=u)
 
@@ -151,10 +150,14 @@ class DescriptorSystem:
     regression: object = None
 
     @property
+    def followed(self) -> frozenset[str]:
+        """Names of the inputs and outputs that matrices depend on."""
+        return frozenset[str]().union(*self.coefficients.signals.values())
+
+    @property
     def depends_on_outputs(self) -> bool:
         """Whether some matrix depends on an output: the plant is not linear in its state."""
-        depends = self.coefficients.signals.values()
-        return any(not names.isdisjoint(self.outputs) for names in depends)
+        return not self.followed.isdisjoint(self.outputs)
 
     @property
     def theta_varies(self) -> bool:

@@ -15,6 +15,7 @@ were rejected: they lose half the digits with every order.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from inspect import Parameter, signature
@@ -58,11 +59,11 @@ class FunctionCoefficients:
         self, t: Array, order: int, inside: Array | None = None, _moved: object = None  # noqa: ARG002
     ) -> Entries:
         """All entries that are not zero at the times t (N,), as ``model.entries`` has them."""
+        if self.signals:
+            return entries_of(self.taylor(t, order), self.constant)
         values: dict[str, Array] = {}
         places: dict[str, Places] = {}
         for name in MATRIX_NAMES:
-            if name in self.signals:
-                return entries_of(self.taylor(t, order), self.constant)
             found = self._values(name, t[:1] if name in self.fixed else t, order, None)
             if name in self.places:
                 values[name], places[name] = found, self.places[name]
@@ -189,7 +190,7 @@ class FunctionCoefficients:
             for coefficient in signals[-2::-1]:
                 there = there * away + coefficient
             arguments = [there[:, : self.shapes["u"][0]], there[:, self.shapes["u"][0] :]]
-        t = t + away[:, 0] if np.iscomplexobj(away) else t
+        t = t + away[:, 0]
         try:
             value = function(t, *arguments[: _arguments(function) - 1])
             value = np.asarray(self._picked(name, value) if name in self.places else value)
@@ -216,10 +217,10 @@ class FunctionCoefficients:
 class Names:
     """Names of a plant given by functions; by default x1 …, u1 …, theta1 …, y1 …"""
 
-    states: Sequence[str] = field(default_factory=tuple)
-    inputs: Sequence[str] = field(default_factory=tuple)
-    unknowns: Sequence[str] = field(default_factory=tuple)
-    outputs: Sequence[str] = field(default_factory=tuple)
+    states: Sequence[str] = ()
+    inputs: Sequence[str] = ()
+    unknowns: Sequence[str] = ()
+    outputs: Sequence[str] = ()
 
 
 def system_from_functions(
@@ -277,8 +278,10 @@ def system_from_functions(
         >>> plant.states, plant.outputs
         (('x1', 'x2'), ('y1',))
     """
-    x0 = np.asarray(initial_state, dtype=np.float64)
-    n = len(x0)
+    x0 = _numbers(initial_state, f"plant {name}: initial_state")
+    n = x0.size
+    if x0.shape != (n,):
+        raise ConfigError(f"plant {name}: initial_state has shape {x0.shape}, expected ({n},)")
     names = names or Names()
     q, m = _rows(theta), len(names.inputs) or _rows(u)
     r = len(names.outputs) or _rows(C, m)
@@ -305,6 +308,11 @@ def system_from_functions(
             functions[key] = tuple(listed)
             probe = listed[0](_PROBES) if _arguments(listed[0]) == 1 else None
             if isinstance(probe, list | tuple) and all(map(is_sparse, probe)):
+                wrong = [matrix.shape for matrix in probe if matrix.shape != shape]
+                if wrong:
+                    raise ConfigError(
+                        f"plant {name}: {key} returned a matrix {wrong[0]}, expected {shape}"
+                    )
                 stored = np.concatenate([np.ravel_multi_index(m.tocoo().coords, m.shape)
                                          for m in probe])
                 places[key] = np.unravel_index(np.unique(stored), shape)
@@ -318,7 +326,7 @@ def system_from_functions(
             if count > 1:
                 signals[key] = frozenset(inputs if count == 2 else (*inputs, *outputs))
         else:
-            value = np.asarray(entry.toarray() if is_sparse(entry) else entry, dtype=np.float64)
+            value = _numbers(entry, f"plant {name}: {key}")
             if value.shape != shape:
                 raise ConfigError(
                     f"plant {name}: {key} has shape {value.shape}, expected {shape} "
@@ -339,6 +347,15 @@ def system_from_functions(
     )
 
 
+def _numbers(entry: Any, where: str) -> Array:
+    """An entry that is no function as an array."""
+    with suppress(TypeError, ValueError):
+        found = np.asarray(entry.toarray() if is_sparse(entry) else entry)
+        if not np.iscomplexobj(found):
+            return found.astype(np.float64, copy=False)
+    raise ConfigError(f"{where} is not an array of real numbers")
+
+
 def _arguments(function: Function) -> int:
     """How many arguments a function has to be given."""
     given = signature(function).parameters.values()
@@ -356,7 +373,7 @@ def _rows(entry: Entry | None, inputs: int = 0) -> int:
         first = first(np.zeros(1), *signals)[0]
     if is_sparse(first):
         return int(first.shape[0])
-    return 0 if first is None else len(np.asarray(first))
+    return 0 if first is None else len(np.atleast_1d(first))
 
 
 def names_of(

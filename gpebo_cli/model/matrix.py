@@ -77,13 +77,7 @@ def matrix(
         return _numbers(plant, key, value, down, across)
     if isinstance(value, Mapping) and value:
         return _by_place(plant, key, value, down, across)
-    rows = items_of(value)
-    if rows is None:
-        raise ConfigError(
-            f"{plant}: {key} must be a list of {counted(n_rows, 'row')}, not {brief(value)}"
-        )
-    if len(rows) != n_rows:
-        raise ConfigError(f"{plant}: {key} has {counted(len(rows), 'row')} but {down}")
+    rows = per_row(plant, key, value, down, f"be a list of {counted(n_rows, 'row')}", "row")
     grid: list[list[tuple[int, object]]] = []
     for i, row in enumerate(rows):
         entries = items_of(row)
@@ -102,6 +96,18 @@ def matrix(
     if widths[0] != n_columns:
         raise ConfigError(f"{plant}: {key} has {counted(widths[0], 'column')} but {across}")
     return grid
+
+
+def per_row(
+    plant: str, key: str, value: object, rows: Side, must: str, noun: str
+) -> list[object]:
+    """The items of a list, as many as there are rows (ConfigError: it is none, or has others)."""
+    items = items_of(value)
+    if items is None:
+        raise ConfigError(f"{plant}: {key} must {must}, not {brief(value)}")
+    if len(items) != len(rows.names):
+        raise ConfigError(f"{plant}: {key} has {counted(len(items), noun)} but {rows}")
+    return items
 
 
 def _by_place(

@@ -16,7 +16,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.expressions import RESERVED, Expression, parse, shorten, signal
-from gpebo_cli.model.matrix import Side, brief, counted, is_empty, items_of, listed, matrix
+from gpebo_cli.model.matrix import Side, brief, counted, is_empty, items_of, listed, matrix, per_row
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
 from gpebo_cli.schema import check_keys, nearest
 
@@ -162,7 +162,7 @@ def _entries(
         "B": (rows, driven, _OF_ALL),
     }
     phi, of = mapping.get("phi"), f"{counted(len(states), 'entry')}, one for each row of E"
-    known = [] if is_empty(phi) else _one_each(plant, "phi", phi, rows, f"be a list of {of}")
+    known = [] if is_empty(phi) else per_row(plant, "phi", phi, rows, f"be a list of {of}", "entry")
     entries: dict[str, MatrixEntries] = {
         "phi": (
             (len(states),),
@@ -249,7 +249,7 @@ def _names(plant: str, key: str, value: object) -> tuple[str, ...]:
 
 def named_values(plant: str, key: str, value: object, example: str) -> dict[str, object]:
     """What a key of a file has by name, in its order (ConfigError: no mapping, or no names)."""
-    if value is None or value == []:
+    if is_empty(value):
         return {}
     if not isinstance(value, Mapping):
         raise ConfigError(
@@ -297,18 +297,6 @@ def read_parameters(
     return parameters
 
 
-def _one_each(
-    plant: str, key: str, value: object, rows: Side, must: str, noun: str = "entry"
-) -> list[object]:
-    """A list with as many items as there are rows."""
-    items = items_of(value)
-    if items is None:
-        raise ConfigError(f"{plant}: {key} must {must}, not {brief(value)}")
-    if len(items) != len(rows.names):
-        raise ConfigError(f"{plant}: {key} has {counted(len(items), noun)} but {rows}")
-    return items
-
-
 def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[str, object]:
     """Initial value by state, in the order of the states."""
     if isinstance(value, Mapping):
@@ -323,7 +311,7 @@ def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[
             raise ConfigError(f"{plant}: initial_state lacks {listed(missing)}")
         return {state: value[state] for state in states}
     must = f"map states to numbers or list {counted(len(states), 'number')}"
-    values = _one_each(plant, "initial_state", value, Side("state", states), must, "value")
+    values = per_row(plant, "initial_state", value, Side("state", states), must, "value")
     return dict(zip(states, values, strict=True))
 
 

@@ -9,7 +9,8 @@ import csv
 import difflib
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from math import isnan, pi
 from operator import ne
@@ -80,7 +81,10 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     _find_time(header, cells, (*system.inputs, *system.outputs), found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
-    every = list(csv.reader(lines[1:], delimiter=found.separator))
+    try:
+        every = list(csv.reader(lines[1:], delimiter=found.separator))
+    except csv.Error as error:
+        raise ConfigError(f"{path} is not CSV: {error}") from None
     for name in system.inputs:
         k = header.index(found.columns[name]) if name in found.columns else len(header)
         known = [row[k] for row in every if k < len(row) and row[k].strip().lower() not in MISSING]
@@ -99,10 +103,11 @@ def _table(path: str, lines: Sequence[str], found: Guess) -> list[list[str]]:
     """Header and rows, split by the character that gives all of them most cells, and as many."""
     best: list[list[str]] = []
     for separator in _SEPARATORS:
-        rows = list(csv.reader(lines, delimiter=separator))
-        widths = {len(row) for row in rows}
-        if len(widths) == 1 and len(rows[0]) > max(1, len(best[0]) if best else 1):
-            best, found.separator = rows, separator
+        with suppress(csv.Error):  # by a wrong one, a line may be longer than a cell can be
+            rows = list(csv.reader(lines, delimiter=separator))
+            widths = {len(row) for row in rows}
+            if len(widths) == 1 and len(rows[0]) > max(1, len(best[0]) if best else 1):
+                best, found.separator = rows, separator
     if not best:
         raise ConfigError(
             f"{path}: no character of comma, semicolon, tab and space cuts its first lines into "
@@ -206,7 +211,7 @@ def _find_signals(
         found.doubts.append(f"no column was found for {signal}: write it to data.columns.{signal}")
     for signal, name in found.columns.items():
         unit = system.units.get(signal, "")
-        for written in _units(name) if signal != TIME and unit else ():
+        for written in _units(name) if unit else ():
             factor = _factor(written, unit)
             if factor is None:
                 found.doubts.append(
@@ -244,11 +249,11 @@ def _factor(written: str, unit: str) -> float | None:
     return None
 
 
-def _prefixed(unit: str) -> list[tuple[float, str]]:
+def _prefixed(unit: str) -> Iterator[tuple[float, str]]:
     """The unit itself, and without the first letter where that may be a prefix."""
-    of_letter = _PREFIXES.get(unit[:1])
-    cut = [] if of_letter is None or unit == "min" else [(of_letter, unit[1:])]
-    return [(1.0, unit), *cut] if unit[1:] else [(1.0, unit)]
+    yield 1.0, unit
+    if unit[:1] in _PREFIXES and unit[1:] and unit != "min":
+        yield _PREFIXES[unit[0]], unit[1:]
 
 
 def _as_usual(unit: str) -> tuple[float, str]:

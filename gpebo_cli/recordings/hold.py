@@ -18,6 +18,7 @@ import numpy as np
 
 from gpebo_cli.errors import printable
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
+from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.schema import unknown
@@ -82,11 +83,7 @@ def held(t: Array, values: Array, hold: Hold) -> Held:
         spline = CubicSpline(t, values, axis=0)
         return lambda at, _inside: np.asarray(spline(at), dtype=np.float64)
     if hold == "zoh":
-        def last(_at: Array, inside: Array) -> Array:
-            return np.asarray(values[np.searchsorted(t, inside, side="right") - 1])
-
-        return last
-
+        return lambda _at, inside: np.asarray(values[np.searchsorted(t, inside, side="right") - 1])
     slope = np.diff(values, axis=0) / np.diff(t)[:, None]
 
     def line(at: Array, inside: Array) -> Array:
@@ -101,11 +98,10 @@ def edges(t: Array, cuts: Array) -> Array:
 
     A cut on a sample is that sample.
     """
-    if len(cuts) == 0 or len(t) < 2:
+    if not len(cuts):
         return t
     k = np.clip(np.searchsorted(t, cuts), 1, len(t) - 1)
-    near = np.minimum(cuts - t[k - 1], t[k] - cuts) <= _SMALLEST * (t[k] - t[k - 1])
-    return np.unique(np.concatenate([t, cuts[~near]]))
+    return with_others(t, cuts, _SMALLEST * (t[k] - t[k - 1]))
 
 
 def recording_mesh(

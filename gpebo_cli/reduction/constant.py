@@ -159,12 +159,11 @@ def _constraints(e: Array, a: Array, max_mu: int) -> tuple[list[tuple[Array, lis
         if rank == n:
             return found, least
         kept, gone = U[:, :rank].T, U[:, rank:].T
-        found.append((gone @ left, [gone @ p for p in known]))
-        C, of_f = found[-1]
-        now, left = np.concatenate([kept @ now, C]), np.concatenate([kept @ left, np.zeros_like(C)])
-        nothing = np.zeros_like(C)
+        C, of_f, nothing = gone @ left, [gone @ p for p in known], np.zeros((n - rank, n))
+        found.append((C, of_f))
+        now, left = np.concatenate([kept @ now, C]), np.concatenate([kept @ left, nothing])
         known = [
-            np.concatenate([kept @ p if p is not None else np.zeros((rank, n)), -q])
-            for p, q in zip([*known, None], [nothing, *of_f], strict=True)
+            np.concatenate([kept @ p, -q])
+            for p, q in zip([*known, np.zeros((n, n))], [nothing, *of_f], strict=True)
         ]
     raise UndecidedError

@@ -20,22 +20,15 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.kernels.arrays import joined
-from gpebo_cli.model.descriptor import (
-    Array,
-    BoolArray,
-    Changed,
-    Coefficients,
-    DescriptorSystem,
-)
+from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.scaling import Units, units_at
-from gpebo_cli.reduction.strangeness_free import reduced
+from gpebo_cli.reduction.strangeness_free import LOOKS, reduced
 from gpebo_cli.reduction.structure import Structure, analyse
 
-_LOOKS = 32  # times at which rounding is looked at
 _AHEAD = np.linspace(0.0, 1.0, 17)  # of what of the plant is looked at before its samples come
 _SEEN = 2  # derivatives at the start by which an entry that is zero there is known
 _MOVED = 1e-8  # of hidden constraints: what derivatives of an output may change by rounding
@@ -75,7 +68,7 @@ class InputDerivatives:
     exact: bool = True  # whether they are those of the inputs, not of what stands for their samples
 
     @classmethod
-    def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives | None:
+    def of_plant(cls, system: DescriptorSystem, known: BoolArray) -> InputDerivatives:
         """Exact ones, of the inputs (m,) that are the plant's own functions of time."""
         source = system.coefficients.of_time
         return cls(known, lambda t, inside, order: source.taylor(t, order, inside).u)
@@ -118,11 +111,6 @@ class EquationForm:
         return cls(system, units, inputs=inputs)
 
     @property
-    def follows_signals(self) -> bool:
-        """Whether matrices depend on what is measured."""
-        return bool(self.system.coefficients.signals)
-
-    @property
     def known_term(self) -> bool:
         """Whether there is a φ."""
         return "phi" not in self.system.coefficients.zero
@@ -136,9 +124,8 @@ class EquationForm:
 
     def noise_enters(self, noisy: BoolArray) -> tuple[str, ...]:
         """Which of the ``noisy`` ones of [u; y] (m + r,) have their noise in matrices or slopes."""
-        system, slopes = self.system, (self.system.inputs[j] for j in self.interpolated)
-        names = frozenset(slopes).union(*system.coefficients.signals.values())
-        both = compress((*system.inputs, *system.outputs), noisy)
+        names = self.system.followed.union(self.system.inputs[j] for j in self.interpolated)
+        both = compress((*self.system.inputs, *self.system.outputs), noisy)
         return tuple(name for name in both if name in names)
 
     def driving(self, t: Array, inside: Array, u: Array) -> Array:
@@ -205,7 +192,7 @@ class EquationForm:
         self, t: Array, inside: Array, signals: Array | None, order: int
     ) -> Array | None:
         """Taylor coefficients of [u, y] (order + 1, N, m + r), of y and unknown u's values only."""
-        if not self.follows_signals:
+        if not self.system.followed:
             return None
         if signals is None:
             raise ValueError("the matrices follow signals, and none are given")
@@ -232,11 +219,11 @@ def hidden_constraints(
     for i in range(mu + 1):
         for k in range(i + 1):
             blocks[i, :, :, k] = c.B[i - k]
-    parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[: mu + 1, :, :, None], c.F[: mu + 1]
+    parts = blocks.reshape(mu + 1, len(t), n, -1), c.phi[..., None], c.F
     g = np.concatenate(
         [np.broadcast_to(part, (mu + 1, len(t), n, part.shape[3])) for part in parts], axis=3
     )
-    every = max(1, len(t) // _LOOKS)
+    every = max(1, len(t) // LOOKS)
     A2, f2, made_of, _ = reduced(system, structure, E, A, g, t, every)
     terms = np.abs(g * weights[:, None, :, None]).max(axis=(0, 2))[:, None, :]
     A2 = A2 * (units / s.columns)
@@ -283,9 +270,8 @@ def strangeness_free(
     whole = replace(given, structure=structure, derivatives=tuple(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
     ))
-    followed = frozenset[str]().union(*source.signals.values())
     for j, name in enumerate(system.inputs):
-        if name in followed and structure.mu and (inputs is None or not inputs.known[j]):
+        if name in system.followed and structure.mu and (inputs is None or not inputs.known[j]):
             raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
     if found is None:
@@ -315,9 +301,8 @@ def _refuse_slopes(
 ) -> None:
     """Refuse hidden constraints that change with the derivatives of an output."""
     system, structure = form.system, form.structure
-    followed = frozenset[str]().union(*system.coefficients.signals.values())
     for j, name in enumerate(system.outputs):
-        if name not in followed or structure is None:
+        if name not in system.followed or structure is None:
             continue
         slopes = np.zeros((structure.mu, 1, system.r))
         size = float(np.abs(signals[:, system.m + j]).max()) or 1.0

@@ -82,7 +82,7 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
     some = sizes > 0.0
     while True:
         (kind, i, j), logs = (place[some] for place in places), np.log(sizes[some])
-        terms = _Terms.at(i, j, np.asarray(kind - 1, dtype=np.float64), (n, n))
+        terms = _Terms.at(i, j, kind - 1, (n, n))
         factors = terms.nearest(np.ones(len(logs)), logs)
         rest = terms.counting(factors, logs)
         if rest.all():
@@ -94,9 +94,9 @@ def _scaling(factors: Array, n: int) -> Scaling:
     """From the logarithms of the factors (2 n + 1,)."""
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
-    weights = 10.0 ** np.rint((r - r[0]) / np.log(10.0)) if n else np.zeros(0)
+    weights = 10.0 ** np.rint((r - r[:1]) / np.log(10.0))
     powers = np.exp2(np.rint(factors / np.log(2.0)))
-    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), np.asarray(weights))
+    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), weights)
 
 
 def units_at(c: Coefficients) -> Units:
@@ -159,16 +159,9 @@ class _Terms(NamedTuple):
     each: Array | None = None  # (a + b + 1, e) all of it, where there are few
 
     @classmethod
-    def of(cls, there: BoolArray, order: NDArray[np.int8]) -> _Terms:
-        """For the entries that are ``there``, derivatives of this ``order`` (2, a, b)."""
-        kind, i, j = there.nonzero()
-        of_time = np.asarray(kind + order[kind, i, j] - 1, dtype=np.float64)
-        return cls.at(i, j, of_time, there.shape[1:])
-
-    @classmethod
-    def at(cls, i: IntArray, j: IntArray, of_time: Array, shape: tuple[int, ...]) -> _Terms:
-        """For entries (e,) of rows i and columns j of a matrix of this shape."""
-        return cls(i, shape[0] + j, of_time, (shape[0], shape[1] + 1))
+    def at(cls, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, ...]) -> _Terms:
+        """For entries (e,) of rows i and columns j of a matrix of this shape, with τ^order each."""
+        return cls(i, shape[0] + j, order.astype(np.float64), (shape[0], shape[1] + 1))
 
     @property
     def total(self) -> int:
@@ -239,9 +232,10 @@ def _balancing(
     there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
 ) -> tuple[_Terms, Callable[[Array], Array]]:
     """The terms, and :meth:`_Terms.nearest` with those of E counted ``mass`` times."""
-    present = np.frombuffer(there, dtype=np.bool_).reshape(shape)
-    terms = _Terms.of(present, np.frombuffer(order, np.int8).reshape(shape))
-    counts = np.where(present.nonzero()[0], 1.0, mass)
+    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(shape).nonzero()
+    derivative = np.frombuffer(order, np.int8).reshape(shape)[kind, i, j]
+    terms = _Terms.at(i, j, kind + derivative - 1, shape[1:])
+    counts = np.where(kind, 1.0, mass)
     if terms.total > 2 * _KEPT + 1 or terms.total * len(counts) > _SOLVED:
         return terms, partial(terms.nearest, counts)
     each = np.array([terms @ factor for factor in np.eye(terms.total)])

@@ -24,7 +24,7 @@ from gpebo_cli.reduction.structure import RESIDUAL, Structure, unclear_ranks, wh
 MAX_GROWTH = 3e2  # of the elimination; beyond it singular vectors are computed instead
 _EPS = float(np.finfo(float).eps)
 _MOVED = ("E", "A", "B", "F", "u", "theta", "phi")
-_LOOKS = 32  # times at which the sensitivity to rounding is looked at
+LOOKS = 32  # times at which the sensitivity to rounding is looked at
 
 
 def forcing(c: Coefficients) -> Array:
@@ -74,8 +74,6 @@ def strangeness_free_form(
     if c is None:
         c = system.coefficients.taylor(t, mu, inside)
     zero, direct = system.coefficients.zero, direct_part(c, system.coefficients.zero)
-    reference = structure.reference
-    pivots = reference.rows, reference.columns, reference.rank, reference.Z1
     F, theta = c.F, c.theta
     if "phi" not in zero:  # one more unknown, whose value is known to be 1
         one = np.zeros((*theta.shape[:2], 1))
@@ -85,9 +83,9 @@ def strangeness_free_form(
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)
-    every = max(1, len(t) // _LOOKS)
+    every = max(1, len(t) // LOOKS)
     found = None if structure.stages else kernels.structure.eliminated(
-        E, A, *model, c.B, F, c.u, theta, *pivots, every, MAX_GROWTH, RESIDUAL
+        E, A, *model, c.B, F, c.u, theta, *structure.reference, every, MAX_GROWTH, RESIDUAL
     )
     if found is None:
         f = forcing(c)
@@ -157,7 +155,7 @@ def reduced(
     Taylor coefficients to the order μ (μ + 1, N or 1, n, n), f those of each column (μ + 1, N, n,
     c); at ``every`` so many times sizes are looked at.
     """
-    mu, s, known = structure.mu, structure.scaling, structure.reference
+    mu, s = structure.mu, structure.scaling
     e, a = scaled(E, A, s.rows, s.columns, s.time, mu + 1)
     weights = (s.time ** np.arange(mu + 1))[:, None] * s.rows
     g = f[: mu + 1] * weights[:, None, :, None]
@@ -174,7 +172,7 @@ def reduced(
     # [Â2 | f2] = Z2ᵀ [N | g] with g = (f_0, …, f_μ)
     g = np.moveaxis(g, 0, 1).reshape(len(t), -1, g.shape[3])
     A2, f2, size, inverse, poor = by_elimination(
-        e[0], M, N, g, known.rows, known.columns, known.rank, known.Z1, every, MAX_GROWTH, RESIDUAL
+        e[0], M, N, g, *structure.reference, every, MAX_GROWTH, RESIDUAL
     )
     if not poor.any():
         return Reduced(A2, f2, size, inverse)

@@ -7,7 +7,7 @@ Kunkel & Mehrmann, Differential-Algebraic Equations, Hypothesis 3.48: ranks of t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -40,9 +40,9 @@ class Pivots(NamedTuple):
     with X = M[rest, columns] M[rows, columns]⁻¹ costs one LU where an SVD costs thirty.
     """
 
-    rank: int  # r
     rows: IntArray  # (rows,) all of them, the r pivots first
     columns: IntArray  # (columns,) likewise
+    rank: int  # r
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
@@ -87,7 +87,7 @@ def without_equations() -> Structure:
     return Structure(
         mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0, ones), rank_tol=0.0,
         smallest_singular_value=np.inf, time_invariant=True,
-        reference=Pivots(0, none, none, np.zeros((0, 0))), steady=True, dynamics=None,
+        reference=Pivots(none, none, 0, np.zeros((0, 0))), steady=True, dynamics=None,
     )
 
 
@@ -143,19 +143,18 @@ def _analysed(
             more = system.coefficients.taylor(t, mu + 1)
             if _judged(t, more, mu + 1, scaling, rank_tol, invariant).a != levels.a:
                 raise unclear_ranks(system, t, UnclearError(0, rounding=True))
-        lines = partial(
-            _lines, mu=mu, scaling=scaling, rank_tol=rank_tol, a=levels.a,
-            reference=levels.reference,
-        )
-        steady = invariant or _follow_dips(system, t, levels.smallest, mu, rank_tol, lines)
-        if not levels.a and "E" not in system.coefficients.constant:
-            _refuse_crossing(system, t, c.E[0])
-        return Structure(
+        found = Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=levels.reference, steady=steady,
+            reference=levels.reference, steady=True,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
+        if not invariant:
+            steady = _follow_dips(system, t, levels.smallest, mu, rank_tol, partial(_lines, found))
+            found = replace(found, steady=steady)
+        if not levels.a and "E" not in system.coefficients.constant:
+            _refuse_crossing(system, t, c.E[0])
+        return found
     staged = _in_stages(system, t, max_mu, rank_tol)
     if staged is not None:
         return staged
@@ -232,7 +231,7 @@ def _in_stages(
     return Structure(
         mu=mu, a=a, d=n - a, scaling=s, rank_tol=rank_tol,
         smallest_singular_value=float(stages.smallest[:, :3].min()), time_invariant=len(t) == 1,
-        reference=Pivots(0, none, none, np.zeros((n, 0))), steady=steady,
+        reference=Pivots(none, none, 0, np.zeros((n, 0))), steady=steady,
         dynamics=None if singular.any() else W1 @ A @ inverse[:, :, : n - a] / s.time,
         stages=ranks,
     )
@@ -304,12 +303,12 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
             narrow = narrow[:: 1 + len(narrow) * _NARROW // _MOST_PROBES]
             places = (np.arange(_NARROW) + 0.5) / _NARROW
             looks = edges[narrow, None] + steps[narrow, None] * places
-            t = np.unique(np.concatenate([t, looks.ravel()]))
+            t = np.union1d(t, looks)
     if not len(jumps):
         return t
     cuts = np.concatenate([[start], jumps, [stop]])
     middles = 0.5 * (cuts[:-1] + cuts[1:])  # no piece between jumps goes unprobed
-    return np.unique(np.concatenate([t, middles]))
+    return np.union1d(t, middles)
 
 
 def _judged(
@@ -327,10 +326,8 @@ def _judged(
     )
     if failure:
         return _Levels(a, smallest, failure)
-    reference = Pivots((mu + 1) * n - a, rows, columns, Z1)
-    bounds, left, dynamics = kernels.structure.bounds(
-        *model, rows, columns, reference.rank, Z1
-    )
+    reference = Pivots(rows, columns, (mu + 1) * n - a, Z1)
+    bounds, left, dynamics = kernels.structure.bounds(*model, *reference)
     finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
     if invariant:
         return _Levels(a, smallest, "", reference, float(smallest.min()), finite)
@@ -478,24 +475,21 @@ def _follow_dips(
 _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
-def _lines(
-    _: Array, c: Coefficients, column: IntArray, *, mu: int, scaling: Scaling, rank_tol: float,
-    a: int, reference: Pivots,
-) -> Array:
-    """Columns (D,) of the levels that belong to ``a`` constraints, (D, points).
+def _lines(structure: Structure, _: Array, c: Coefficients, column: IntArray) -> Array:
+    """Columns (D,) of the levels that belong to the constraints there are, (D, points).
 
     The times of c are those of one grid for each, one after the other. Bounds of them from below
     serve as well, where none of them comes near zero.
     """
-    model = scaling.rows, scaling.columns, scaling.time, mu + 1
-    bounds, left, _ = kernels.structure.bounds(
-        c.E, c.A, *model, reference.rows, reference.columns, reference.rank, reference.Z1
-    )
+    s, rank_tol = structure.scaling, structure.rank_tol
+    model = s.rows, s.columns, s.time, structure.mu + 1
+    bounds, left, _ = kernels.structure.bounds(c.E, c.A, *model, *structure.reference)
     lines = bounds.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column]
     sound = (lines > max(_PLAIN, 10.0 * rank_tol)).all(axis=1)
     sound &= (left.reshape(-1, _DIP_POINTS) <= RESIDUAL).all(axis=1)
     for i in np.flatnonzero(~sound).tolist():
         some = slice(i * _DIP_POINTS, (i + 1) * _DIP_POINTS)
         E, A = (x if x.shape[1] == 1 else x[:, some] for x in (c.E, c.A))
-        lines[i] = kernels.structure.levels(E, A, *model, rank_tol, a)[1][:, column[i]]
+        levels = kernels.structure.levels(E, A, *model, rank_tol, structure.a)[1]
+        lines[i] = levels[:, column[i]]
     return np.asarray(lines)

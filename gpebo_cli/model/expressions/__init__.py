@@ -27,14 +27,7 @@ from gpebo_cli.model.expressions.bounds import (
 )
 from gpebo_cli.model.expressions.nodes import divisors_of
 from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
-from gpebo_cli.model.expressions.tape import (
-    Assembly,
-    Tape,
-    aside,
-    on_their_side,
-    record,
-    taylor,
-)
+from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, on_their_side, record, taylor
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",

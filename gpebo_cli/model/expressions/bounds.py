@@ -325,7 +325,7 @@ def blurred(tape: Tape, t: Array) -> Array:
     An argument f that may vanish is rounded by some ε: less than min_k |ε/f_k|^(1/k) does not show.
     """
     arguments = tape.of([s.argument for s in tape.switches if s.affine is None])
-    if not arguments.outputs or not len(t):
+    if not arguments.outputs:
         return np.zeros(len(t))
     least, most = (bound[0] for bound in Bounds(arguments).of(t, t, 0))
     orders = np.arange(1, _MULTIPLE + 1)

@@ -182,10 +182,9 @@ def wave(name: str, a: Jet, order: int) -> Jet:
     c: Jet = [np.cosh(a[0]) if hyperbolic else np.cos(a[0])]
     w = weighted(a, order)
     for k in range(1, order + 1):
-        s_k = convolve(w, c, k, first=1) / k
-        c_k = convolve(w, s, k, first=1) / k
-        s.append(s_k)
-        c.append(c_k if hyperbolic else -c_k)
+        s.append(convolve(w, c, k, first=1) / k)
+        slope = convolve(w, s, k, first=1) / k
+        c.append(slope if hyperbolic else -slope)
     return s if name.startswith("s") else c
 
 

@@ -51,13 +51,13 @@ class Row(NDArrayOperatorsMixin):
 class Recorder:
     """The operations recorded so far; equal ones once."""
 
-    def __init__(self, signals: tuple[int, int] = (0, 0)) -> None:
+    def __init__(self, signals: tuple[int, int] | None) -> None:
         self.rows: dict[Key, Row] = {}
         self.constants: dict[float, int] = {}
         self.t, self.inside = Row(self, 0), Row(self, 1)
-        orders, number = signals
+        orders, number = signals or (0, 0)
         self.given = _GIVEN + orders * number
-        self.signals = [
+        self.signals = None if signals is None else [
             [Row(self, _GIVEN + k * number + j) for k in range(orders)] for j in range(number)
         ]
 

@@ -114,15 +114,15 @@ def parse(
         node = reader.read(_syntax_tree(value), 0)
     except FoldError as error:
         raise ConfigError(f"{where} = {shorten(value)}: {error}") from None
-    except RecursionError:
+    except (MemoryError, RecursionError):  # MemoryError: the parser says so
         raise ConfigError(f"{where} = {shorten(value)}: it is nested too deeply") from None
     return Expression(node, value, where, tuple(reader.used.values()))
 
 
-def shorten(text: str, limit: int = 60) -> str:
+def shorten(text: str) -> str:
     """The text in quotes, on one line, with its middle left out where it is long."""
-    if len(text) > limit:
-        text = f"{text[: limit // 2]}...{text[-limit // 4 :]}"
+    if len(text) > 60:
+        text = f"{text[:30]}...{text[-15:]}"
     return repr(text)
 
 
@@ -155,8 +155,6 @@ def _syntax_tree(text: str) -> ast.expr:
             warnings.simplefilter("ignore")
             # Line breaks (folded YAML text) would end the expression for Python.
             return ast.parse(" ".join(text.split()), mode="eval").body
-    except (MemoryError, RecursionError):  # the parser's words for "nested too deeply"
-        raise FoldError("it is nested too deeply") from None
     except (SyntaxError, ValueError) as error:
         reason = getattr(error, "msg", None) or str(error)
         if "nested parentheses" in reason:

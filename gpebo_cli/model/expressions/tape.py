@@ -128,13 +128,11 @@ class Tape:
         Jumps are decided at other times if ``apart``. With ``signals``, so many coefficients of so
         many are given.
         """
-        recorder = Recorder(signals or (0, 0))
-        known = None if signals is None else recorder.signals
+        recorder = Recorder(signals)
+        inside = recorder.inside if apart else recorder.t
         try:
             with np.errstate(divide="raise", over="raise", invalid="raise", under="ignore"):
-                places = self.run(
-                    recorder.t, order, recorder.inside if apart else recorder.t, known
-                )
+                places = self.run(recorder.t, order, inside, recorder.signals)
         except FloatingPointError:
             return None
         return finished(recorder, places, self.outputs, order)

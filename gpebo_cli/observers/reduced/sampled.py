@@ -148,7 +148,7 @@ class SampledObserver(Formulation):
         """The matrices at the times t (N,), and [v; y] (N, · + r, 1) from [u; y] (N, m + r)."""
         o = observer_matrices(
             self.form, t, inside, self.solver.rank_tol, self.first,
-            signals=signals if self.form.follows_signals else None,
+            signals=signals if self.system.followed else None,
         )
         rank = self.first.split.rank
         if o.split.rank != rank:
@@ -243,6 +243,6 @@ def _kernel_is_fixed(
     frame = first.split.frame
     if frame is None:
         return False
-    signals = np.repeat(sample[None], len(t), axis=0) if form.follows_signals else None
+    signals = np.repeat(sample[None], len(t), axis=0) if form.system.followed else None
     E = form.mass(t, t, signals) / form.units.equations[:, None]
     return split_in_frame(E, frame, form.units.states, rank_tol) is not None

@@ -141,12 +141,12 @@ class ReducedSystem(Formulation):
     @cached_property
     def _constant(self) -> ObserverMatrices | None:
         held = self.form.held  # as the first ones are
-        if not held or self.form.follows_signals or _MADE_OF - self.system.coefficients.constant:
+        if not held or self.system.followed or _MADE_OF - self.system.coefficients.constant:
             return None
         return self.first.at_first
 
     def _moving(self, t: Array, inside: Array) -> ObserverMatrices:
-        signals = self.signals.at(t, inside, self.system) if self.form.follows_signals else None
+        signals = self.signals.at(t, inside, self.system) if self.system.followed else None
         return observer_matrices(
             self.form, t, inside, self.solver.rank_tol, self.first, signals=signals
         )
