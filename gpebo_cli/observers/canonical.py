@@ -264,7 +264,7 @@ def _unknown_input_observer(
     b = canonical_blocks(system, t, inside)
     f_b = np.einsum("nij,nj->ni", b.B[:, n_a:], signals.inputs(t, inside))
     y = signals.outputs(t, inside)
-    start, ell = np.array(settings.r0, dtype=np.float64), _output_for_zw(system, settings, b, n_a)
+    start, ell = np.array(settings.r0, dtype=np.float64), _output_for_zw(system, settings, b)
     if start.shape != (2,) or not np.isfinite(start).all():
         raise ConfigError(f"observer.r0: got {settings.r0}; accepted: two finite numbers")
     c, dc = b.C[:, ell, n_a : n_a + 2], b.dC[:, ell, n_a : n_a + 2]
@@ -292,11 +292,9 @@ def _apart_from_zero(entries: Array, size: Array) -> BoolArray:
     return np.asarray(np.maximum(entries.min(axis=0), -entries.max(axis=0)) > _SMALL * size)
 
 
-def _output_for_zw(
-    system: DescriptorSystem, settings: Canonical, b: Blocks, n_a: int
-) -> int:
+def _output_for_zw(system: DescriptorSystem, settings: Canonical, b: Blocks) -> int:
     """ℓ of Assumption 6: asked for by name, or the first output that satisfies it."""
-    row, size = b.C[:, :, n_a:], np.abs(b.C).max(axis=(0, 2))
+    row, size = b.C[:, :, b.n_a :], np.abs(b.C).max(axis=(0, 2))
     fits = _apart_from_zero(row[:, :, :2], size[:, None]).all(axis=1)
     fits &= np.abs(row[:, :, 2]).max(axis=0) <= _ZERO * size
     if settings.output is not None:
@@ -308,7 +306,7 @@ def _output_for_zw(
             return ell
     elif fits.any():
         return int(np.argmax(fits))
-    b1, b2, b3 = system.states[n_a:]
+    b1, b2, b3 = system.states[b.n_a :]
     raise ModelError(
         f"plant {system.name}: Assumption 6 fails: "
         + (f"output {settings.output}" if settings.output else "no output")

@@ -73,27 +73,30 @@ class Gpebo:
     def __post_init__(self) -> None:
         if self.sample_time is not None:
             self._refuse_what_needs_the_past()
-        keeps = isinstance(self.remedy, Plain | OutputInjection)
-        if self.bounds and not keeps:
+        if self.bounds and not self._keeps:
             raise ConfigError(
                 "observer.bounds: parameters that change on the way have none; accepted remedies "
                 "are none and output_injection"
             )
-        if self.unknown_initial is not None and not keeps:
+        if self.unknown_initial is not None and not self._keeps:
             raise ConfigError(
                 "observer.unknown_initial: with this remedy the parameters are about later states, "
                 "which are all unknown; accepted remedies are none and output_injection"
             )
 
+    @property
+    def _keeps(self) -> bool:
+        """Whether the parameters are about the start from beginning to end."""
+        return isinstance(self.remedy, Plain | OutputInjection)
+
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
         """The regression and the state map, with the remedy."""
-        keeps = isinstance(self.remedy, Plain | OutputInjection)
-        lasts = keeps or isinstance(self.remedy, CurrentCoordinates)
+        lasts = self._keeps or isinstance(self.remedy, CurrentCoordinates)
         if not lasts or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
-        if not keeps:
+        if not self._keeps:
             return self._observe(system, signals, solver)
         return lean(
             lambda each: self._observe(system, each, solver), system, signals, solver,
