@@ -245,7 +245,7 @@ class KalmanBucy:
             o, driving = known.matrices(t, inside), known.measured(t, inside)
             return filter_model(o, driving, known.form, steps(inside))
 
-        names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
+        names = (*system.unknowns, *known.labels)
         if not (system.unknowns or known.begin.names):
             raise ConfigError(
                 f"plant {system.name} has neither unknowns nor states that its constraints leave "
