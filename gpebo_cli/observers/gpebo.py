@@ -111,7 +111,7 @@ class Gpebo:
         if self.form != "auto" or self.regression == "paper":
             return self._on(self.form, *arguments)
         plain = isinstance(self.remedy, Plain)
-        found: Observation | ModelError | SolverError
+        found: Observation | None
         known = everything = (True, system.q + system.n)
 
         def few(elements: int) -> SolverSettings:
@@ -129,11 +129,11 @@ class Gpebo:
             why = "which determines more than the equations as given"
             if not known[0]:
                 why = "which tells with more digits what the equations as given tell, or more"
-        except (ModelError, SolverError) as error:
-            found, known, limits = error, (False, -1), solver
+        except (ModelError, SolverError):
+            found, known, limits = None, (False, -1), solver
             why = "for as given its signals are not resolved"
         if known < everything and signals.mesh.size < _LONG:
-            if isinstance(found, Observation):
+            if found is not None:
                 limits = few(4 * found.regression.mesh.size)
             try:
                 other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
@@ -141,7 +141,7 @@ class Gpebo:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass
-        return found if isinstance(found, Observation) else self._on("auto", *arguments)
+        return self._on("auto", *arguments) if found is None else found
 
     def _on(
         self, form: str, system: DescriptorSystem, signals: Measurements, solver: SolverSettings,

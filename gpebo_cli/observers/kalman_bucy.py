@@ -33,6 +33,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.uncertainty import noise_level
 from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
@@ -78,7 +79,7 @@ class FilterModel:
     A: Array  # (N, n, n) of ζ
     b: Array  # (N, n)
     c: Array  # (N, e + r, n)
-    terms: Array  # (N, e + r, n)
+    terms: Array  # (N or 1, e + r, n)
     rows: Array  # (N, e + r, r) Z
     g_y: Array  # (N, e + r)
     from_noise: Array  # (N, n, m + r) Γ
@@ -109,18 +110,15 @@ def filter_model(
     inward = np.zeros((count, q + k, signals.shape[1]))
     inward[:, q:] = o.from_signals
     g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
-    algebraic = o.algebraic @ basis  # 𝒜 B
-    c = np.empty((count, g.shape[1], q + k))
-    c[:, :, :q], c[:, :, q:] = o.G, algebraic
-    terms = np.abs(c)
-    terms[:, :, q:] = np.abs(o.algebraic) @ np.abs(basis)
+    c = joined(o.G, o.on_basis, axis=2)
+    c = np.broadcast_to(c, (count, *c.shape[1:]))
+    terms = joined(np.abs(o.G), np.abs(o.algebraic) @ np.abs(basis), axis=2)
     K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
     gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
     gain[:, :, q:] += basis
     if form.structure is not None:
         # Outputs take no part in the elimination, and the constraints have been used up for w.
-        Z = np.zeros((1, g.shape[1], r))
-        Z[0, g.shape[1] - r :] = np.eye(r)
+        Z = np.eye(g.shape[1])[None, :, -r:]
     else:
         # The residual's r rows: of its n rows with Π, those in the range of E are zero.
         L = o.split.equations

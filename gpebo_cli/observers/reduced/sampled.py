@@ -185,12 +185,7 @@ class SampledObserver(Formulation):
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]),
             of_outputs(self.hold, system.m), scale=scale,
         )
-        errors = None
-        if step is not None:
-            _, _, C, D = o.errors(kept, system.m)
-            errors = ErrorSteps(step, *(
-                np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
-            ))
+        errors = None if step is None else ErrorSteps.at(step, o.errors(kept, system.m))
         resolve(assembled, slice(None), of_gain(), self.form)
         return state, SampledBlock(
             regression, assembled.offset, assembled.gain, z, errors, self.form.units.states

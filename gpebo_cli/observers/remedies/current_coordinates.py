@@ -20,6 +20,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from gpebo_cli.kernels import arrays
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
@@ -80,9 +81,7 @@ class CurrentCoordinates:
             t, inside = times.reshape(2, -1)
             o = reduced.matrices(t, inside)
             signals = reduced.measured(t, inside)
-            rows = np.empty((len(t), k, p + 1))
-            rows[..., :q], rows[..., q:p] = o.from_unknowns, o.dynamics
-            rows[..., p] = (o.from_signals @ signals)[:, :, 0]
+            rows = arrays.joined(o.from_unknowns, o.dynamics, o.from_signals @ signals, axis=2)
             z = np.broadcast_to(identity, (len(t), *identity.shape))
             a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
