@@ -167,7 +167,7 @@ def fits(
     """
     if outside > _TURNED * size:
         return False
-    return 1.0 / max(inverse, TINY) > math.sqrt(max(rank, 1)) * rank_tol * inner
+    return 1.0 / max(inverse, TINY) > math.sqrt(rank) * rank_tol * inner
 
 
 def within_frame(frame: Frame, pinv: Array) -> Split:
