@@ -273,8 +273,7 @@ def _error(
         replace(problem, monitor=None, told=True), mesh, tol=np.inf, max_elements=mesh.size
     )
     values = finer.trajectory.values
-    at = found(mesh.points.ravel(), mesh.inside.ravel()).reshape(values.shape)
-    (P, estimate), (other, same) = quotient(values), quotient(at)
+    (P, estimate), (other, same) = quotient(values), quotient(mesh.along(found).values)
     d = _deviations(P)
     error = float((np.abs(other - P) / (d[:, None, :, None] * d[:, None, None, :])).max())
     kinds = zip(followed(estimate, finer.extras), followed(same, finer.extras), strict=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import triangular
+from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered, state_of
@@ -291,7 +291,7 @@ def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
     Y = with_realisations(psi, Y)
     both = np.concatenate([psi, Y], axis=-1)
-    return np.asarray(np.swapaxes(psi, -1, -2) @ both)
+    return np.asarray(transpose(psi) @ both)
 
 
 def with_realisations(psi: Array, Y: Array) -> Array:
