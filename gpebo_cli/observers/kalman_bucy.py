@@ -252,7 +252,6 @@ class KalmanBucy:
         start = np.concatenate([np.zeros(q), split.dual @ known.xi_a])
         variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
         P0 = _initial_covariance(variances, known)
-        process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
         of_states = known.form.units.states, known.form.units.states[:, None] / sizes
@@ -260,7 +259,8 @@ class KalmanBucy:
             (variances / sizes**2).max(initial=0.0) or 1.0
         ))
         model_noise = NoiseModel(
-            noise.variances * noise.sample_time, process,
+            noise.variances * noise.sample_time,
+            per_name(self.process, names, "estimate", "observer.process", absent=0.0),
             self.regularisation**2 * noise.sample_time * varies,
         )
         fastest, offsets, regularised = _largest(reduced, windows, model_noise, sizes)
@@ -278,14 +278,14 @@ class KalmanBucy:
             x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0] / sizes)
             return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
 
-        used: dict[str, float | int | str | None] = {
-            f"intensity_{name}": float(value)
-            for name, value in zip((*system.inputs, *system.outputs), model_noise.signals,
-                                   strict=True)
-        }
-        share = f"{self.regularisation:g} of each equation's own under P0 "
+        intensities = (f"intensity_{name}" for name in (*system.inputs, *system.outputs))
+        used: dict[str, float | int | str | None] = dict(
+            zip(intensities, model_noise.signals.tolist(), strict=True)
+        )
         if regularised:
-            used["regularised_with"] = f"noise of {share}at {noise.sample_time:g} s"
+            share = f"{self.regularisation:g} of each equation's own under P0"
+            used["regularised_with"] = f"noise of {share} at {noise.sample_time:g} s"
+            note += f"; measurement noise regularised: {share} (observer.regularisation)"
         parts = filter_windows(
             model, start[:, None], P0, windows, tol=solver.tol, max_elements=solver.max_elements,
             monitor=monitor, floor=floor, sizes=sizes,
@@ -333,9 +333,8 @@ class KalmanBucy:
             estimator=Filter(filtered, observability),
             names=names,
             # A drift of the estimates is no constant that would explain all of the data.
-            evidence=None if any(process) else evidence,
-            note=note
-            + f"; measurement noise regularised: {share}(observer.regularisation)" * regularised,
+            evidence=None if model_noise.process.any() else evidence,
+            note=note,
         )
 
 
