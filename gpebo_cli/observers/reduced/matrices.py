@@ -250,19 +250,8 @@ def _by_steps(
         rounding = (np.abs(K) @ np.abs(of_hidden)).max(axis=0) @ hidden.rounding
     dynamics, from_unknowns, from_signals = _moving(split, A, F, B, Q1, K, on_basis, G, g_signals)
     return ObserverMatrices(
-        split=split,
-        output_scale=scale,
-        dynamics=dynamics,
-        from_unknowns=from_unknowns,
-        from_signals=from_signals,
-        algebraic=algebraic,
-        on_basis=on_basis,
-        g_signals=g_signals,
-        G=G,
-        range=Q1,
-        elimination=K,
-        injectivity=injectivity,
-        rounding=rounding,
+        split, scale, dynamics, from_unknowns, from_signals, algebraic, on_basis, g_signals, G, Q1,
+        K, injectivity, rounding,
     )
 
 
