@@ -113,6 +113,7 @@ class Gpebo:
         plain = isinstance(self.remedy, Plain)
         found: Observation | None
         known = everything = (True, system.q + system.n)
+        short = signals.mesh.size < _LONG
 
         def few(elements: int) -> SolverSettings:
             return replace(solver, max_elements=min(solver.max_elements, max(_TRIED, elements)))
@@ -123,7 +124,7 @@ class Gpebo:
             if not plain:
                 return self._on("auto", *arguments)
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
-            short = signals.mesh.size < _LONG
+            limits = few(4 * found.regression.mesh.size)
             if short and not found.note and not _same_on_both_forms(found, system, signals):
                 known = _told(found, system, solver)
             why = "which determines more than the equations as given"
@@ -132,9 +133,7 @@ class Gpebo:
         except (ModelError, SolverError):
             found, known, limits = None, (False, -1), solver
             why = "for as given its signals are not resolved"
-        if known < everything and signals.mesh.size < _LONG:
-            if found is not None:
-                limits = few(4 * found.regression.mesh.size)
+        if known < everything and short:
             try:
                 other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
                 if not plain or _told(other, system, solver) > known:

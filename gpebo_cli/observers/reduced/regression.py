@@ -54,9 +54,7 @@ class Assembled:
         psi = psi / columns[None].repeat(psi.shape[1], axis=0)
         others: BoolArray = np.ones(len(self.moving), dtype=bool)
         if basis is not None:
-            others[:] = self.eliminated | ~basis.any(axis=1)
-            if others.sum() > len(basis) - basis.shape[1]:
-                others[:] = True
+            others = self.eliminated | ~basis.any(axis=1)
         gain, largest = self.gain, self.moving.copy()
         if not others.all():
             gain = gain[:, others]
