@@ -107,8 +107,8 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
 
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
-    on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
-    on_axes &= basis.shape[1] == reduced.first.split.rank  # else they lose what is eliminated
+    # Where the kernel turns, they lose what is eliminated.
+    on_axes = bool(np.count_nonzero(basis) == basis.shape[1] == reduced.first.split.rank)
     axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
     monitor = _Monitor(reduced, units, axes)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
