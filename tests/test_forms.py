@@ -624,6 +624,19 @@ def test_states_of_very_different_sizes_turn_in_the_kernel_of_E(decades, rate):
     assert (np.abs(told - x[-1]) < 1e-7 * np.abs(x).max(axis=0)).all()
 
 
+def test_an_equation_without_states_and_unknowns_is_observed_as_given():
+    """0 = 0: the pencil is singular, and an output sees what no equation determines."""
+    system = plant_from_mapping({
+        "name": "free", "states": ["x", "v"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [0, 0]], "C": [[0, 1]], "initial_state": [0, 0],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    y = Trajectory(mesh, np.sin(mesh.points)[..., None])
+    found = observe(system, Measurements(Trajectory(mesh, np.zeros((8, 6, 0))), y))
+    v = found.state_map.offset
+    np.testing.assert_allclose(v.values[..., 1], np.sin(v.mesh.points), atol=1e-15)
+
+
 @pytest.mark.parametrize(("A", "C"), [
     ({(0, 2): 1}, [0, 0, 0, "step(t - 2)"]),  # a rank that changes
     ({(0, 2): 1}, [0, 1, 0, "t - 2.001"]),  # one that may

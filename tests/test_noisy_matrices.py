@@ -111,5 +111,5 @@ def test_a_copy_that_does_not_settle_is_refused(monkeypatch):
 
 def test_a_response_to_noise_that_is_not_resolved_is_refused(monkeypatch):
     monkeypatch.setattr("gpebo_cli.regression.errors._RESPONSE", 0.0)
-    with pytest.raises(SolverError, match="response to noise is resolved to .* only; lower"):
+    with pytest.raises(SolverError, match=r"response to noise is resolved to .* only; lower"):
         found(shipped("descriptor"), "none", 1.0, 0.1, seeds=2)
