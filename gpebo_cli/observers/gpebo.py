@@ -211,8 +211,7 @@ def _told(
 ) -> tuple[bool, int]:
     """Whether it is told with some digits, and how many unknowns and states are at the end."""
     regression, state_map = found.regression, found.state_map
-    if not isinstance(state_map, AffineStateMap):
-        return False, 0
+    assert isinstance(state_map, AffineStateMap)  # noqa: S101  as it is without a remedy
     ends = regression.mesh.edges[1:]
     last, steady = len(ends) - 1, found.growth is None or found.growth < _BLOWN
     known = known_at(regression, ends[-1:], solver.tol)
