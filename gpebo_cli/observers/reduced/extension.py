@@ -22,6 +22,7 @@ from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMat
 from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
     Assembled,
+    largest_at,
     regression_signals,
     resolve,
     term_sizes,
@@ -175,7 +176,7 @@ class _Monitor:
     def next_window(self, size: int) -> Assembled:
         """What is made of the window of that size, which comes to stand before the next one."""
         K, points = self._whole[0].shape[:2]
-        where = self.latest.largest_at(points)
+        where = largest_at(v.reshape(K, points, v[0].size) for v, _ in self.latest.kinds())
         self._past = [e if e.shape[:2] == (1, 1) else e[where] for e in self._whole]
         return self.latest.after((K - size) * points)
 

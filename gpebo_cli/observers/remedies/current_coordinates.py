@@ -27,7 +27,7 @@ from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import Extension, joined, kept_of
 from gpebo_cli.observers.reduced.matrices import weakest
-from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
+from gpebo_cli.observers.reduced.regression import Assembled, largest_at, regression_signals
 from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
@@ -108,9 +108,7 @@ class CurrentCoordinates:
                     name=f"observer of plant {system.name}",
                 )
                 front = past[0].size
-                past = times[:, np.unique(np.concatenate([
-                    np.abs(v).max(axis=1).argmax(axis=0) for v, _ in seen
-                ]))]
+                past = times[:, largest_at(v for v, _ in seen)]
                 yield Extension(
                     mesh.trajectory(rows[front:]), error, a.after(front),
                     np.broadcast_to(a.column_scale, (mesh.size, p)), reduced.units, smallest,
