@@ -60,7 +60,7 @@ class Extension:
         return mesh.sampled(self.asked, found.offset), mesh.sampled(self.asked, found.gain)
 
     def rows(self, kept: IntArray) -> tuple[Trajectory, Trajectory]:
-        """Y and ψ of the rows that are ``kept``."""
+        """Y (rows,) and ψ (rows, p) of the rows that are ``kept`` (rows,)."""
         found = self.assembled
         some = slice(None) if len(kept) == found.Y.shape[1] else kept  # a slice copies nothing
         return self.mesh.trajectory(found.Y[:, some]), self.mesh.trajectory(found.psi[:, some])
@@ -206,7 +206,7 @@ def _ends(signal: Trajectory) -> Samples:
 
 
 def kept_of(parts: Iterator[Extension], mesh: Mesh, asked: Array | None) -> Iterator[Extension]:
-    """What is kept of the parts on a mesh's windows: all, or the state map at ``asked`` times."""
+    """What is kept of parts on a mesh's windows: all, or the state map at times ``asked`` (M,)."""
     return parts if asked is None else map(Extension.kept_at, parts, mesh.shares(asked))
 
 
