@@ -126,6 +126,15 @@ def test_any_gain_gives_the_same_limit(L_w):
     assert np.abs(error).max() < 10 * decays.evidence["transition_norm"] + 1e-9
 
 
+def test_the_integrals_of_a_diagonal_M_differ_by_what_c1_and_c2_do():
+    """M_w = diag(−a1 c1/c2, −a1 c1/c2 + d/dt ln(c1/c2)): they were good to 6 digits."""
+    system = shipped("canonical")
+    seen = {a.name: a.evidence for a in run(system).assumptions}["Assumption 7"]
+    C = system.coefficients.taylor(np.array([0.0, 20.0]), 0).C[0]
+    change = np.log(C[1, 1, 2] / C[1, 1, 3]) - np.log(C[0, 1, 2] / C[0, 1, 3])
+    assert seen["integral_M22"] - seen["integral_M11"] == pytest.approx(change, rel=1e-10)
+
+
 def test_an_entry_that_is_rounding_shows_no_state():
     """Beside 1 it is nothing; divided by it a state would be any number."""
     mapping = {"N21": 1, "N31": 0.5, "N32": -0.75, "c1": 1, "c2": 2}

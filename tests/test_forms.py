@@ -15,7 +15,7 @@ from test_observer import ROTATING
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, gpebo, observe
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
@@ -622,6 +622,57 @@ def test_states_of_very_different_sizes_turn_in_the_kernel_of_E(decades, rate):
     x, told = found.details.simulation.states, found.details.estimation.states[0, -1]
     assert None not in [found.details.estimable[name] for name in "abce"]
     assert (np.abs(told - x[-1]) < 1e-7 * np.abs(x).max(axis=0)).all()
+
+
+def test_an_equation_without_states_and_unknowns_is_observed_as_given():
+    """0 = 0: the pencil is singular, and an output sees what no equation determines."""
+    system = plant_from_mapping({
+        "name": "free", "states": ["x", "v"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [0, 0]], "C": [[0, 1]], "initial_state": [0, 0],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    y = Trajectory(mesh, np.sin(mesh.points)[..., None])
+    found = observe(system, Measurements(Trajectory(mesh, np.zeros((8, 6, 0))), y))
+    v = found.state_map.offset
+    np.testing.assert_allclose(v.values[..., 1], np.sin(v.mesh.points), atol=1e-15)
+
+
+@pytest.mark.parametrize(("A", "C"), [
+    ({(0, 2): 1}, [0, 0, 0, "step(t - 2)"]),  # a rank that changes
+    ({(0, 2): 1}, [0, 1, 0, "t - 2.001"]),  # one that may
+    # a - b is told, but neither a nor b: w drives their sum, of which nothing is seen.
+    ({(0, 3): 1, (1, 3): 1}, [0, 0, 0, 0]),
+])
+def test_a_failure_of_assumption_1_keeps_nothing_where_no_state_is_told_at_all_times(A, C):
+    entries = np.diag([-1.0, -1.0, 0.0, 0.0])
+    for place, value in A.items():
+        entries[place] = value
+    system = plant_from_mapping({
+        "name": "blind", "states": ["a", "b", "v", "w"], "outputs": ["y"],
+        "E": np.diag([1, 1, 0, 0]).tolist(), "A": entries.tolist(), "C": [C],
+        "initial_state": [0] * 4,
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    u, y = (Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1))
+    with pytest.raises(ModelError, match=r"Assumption 1 .* singular value"):
+        observe(system, Measurements(u, y), form="given")
+
+
+@pytest.mark.parametrize("share", [1.0, 0.7])
+def test_nothing_is_given_up_for_rounding_where_assumption_1_fails(share):
+    """v drives a and b, but not share a − b, which obeys an equation of its own."""
+    plant = {
+        "name": "driven", "states": ["a", "b", "v"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": np.diag([1, 1, 0]).tolist(), "A": [[-1, 0, 1], [0, -1, share], [share, 1, 0]],
+        "B": [[0], [0], [-1]], "C": [[1, 0, 0]], "initial_state": [1, -share, 0],
+    }
+    found = run(
+        plant, time={"horizon": 3.0, "samples": 31}, observer={"name": "gpebo", "form": "given"},
+        estimator={"name": "least_squares", "f0": 1e-14},
+    ).details
+    left = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1])
+    assert (left[:2] < 1e-9).all()
+    assert np.isnan(left[2])
 
 
 def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():

@@ -106,15 +106,15 @@ def normalised_errors(name: str, outputs: float, inputs: float, seeds: int) -> t
     s, basis, first = in_basis(
         system, t, inside, signals.inputs(t, inside), signals.outputs(t, inside)
     )
-    n, q = s.A.shape[1], system.q
+    n = s.A.shape[1]
     intensities = NoiseModel(
         noise.variances * sample_time, np.zeros(n), np.full(n, 1e-6 * 10.0 * sample_time))
 
     def model(t: Array, inside: Array):
-        s, basis, _ = in_basis(
+        s, _, _ = in_basis(
             system, t, inside, signals.inputs(t, inside), signals.outputs(t, inside), first
         )
-        m = intensities.state_space(s, q, basis)
+        m = intensities.state_space(s)
         held = nu[np.floor(inside / sample_time).astype(int)]
         D = transpose(s.rows) @ s.in_measurement
         return m._replace(b=m.b - s.from_noise @ held, z=m.z + D @ held), ()

@@ -101,6 +101,15 @@ def test_unknowns_in_a_noisy_output_are_linearised_with_it():
         assert abs(slope) < 0.05 * curvature
 
 
-def test_a_copy_that_does_not_settle_is_refused():
+def test_a_copy_that_does_not_settle_is_refused(monkeypatch):
     with pytest.raises(SolverError, match="noise_free does not settle; in round"):
         found(shipped("duffing"), "noise_free", 40.0, 0.5, sample_time=0.5)
+    monkeypatch.setattr("gpebo_cli.observers.remedies.noise_free._MOST_ROUNDS", 1)
+    with pytest.raises(SolverError, match="in round 1 the signals that fit the data still change"):
+        found(shipped("duffing"), "noise_free", 2.0, 0.1)
+
+
+def test_a_response_to_noise_that_is_not_resolved_is_refused(monkeypatch):
+    monkeypatch.setattr("gpebo_cli.regression.errors._RESPONSE", 0.0)
+    with pytest.raises(SolverError, match=r"response to noise is resolved to .* only; lower"):
+        found(shipped("descriptor"), "none", 1.0, 0.1, seeds=2)

@@ -12,7 +12,9 @@ from plants import one_state
 from processes import assert_refused, printed, rows_of, write_table
 
 from gpebo_cli import ConfigError, SolverError, check, run
+from gpebo_cli.observers.regression import Given
 from gpebo_cli.regression.text import regression_from_mapping
+from gpebo_cli.settings import SolverSettings
 
 SINE = {"name": "sine", "unknowns": {"a": 2.0, "b": -1.0}, "signals": {"s": "sin(t)"}}
 
@@ -79,6 +81,14 @@ OPERATORS = {
     "signals": {"s": "sin(3*t) + 0.5*cos(t)"},
     "psi": [["lp(s, 2)", "hp(s, 0.7)", "integral(s*s)", "delay(lp(s, 1), 0.35)"]],
 }
+
+
+def test_at_samples_all_signals_have_one_hold():
+    with pytest.raises(ConfigError, match="takes one word for all signals"):
+        Given().at_samples(
+            regression_from_mapping(OPERATORS).system, SolverSettings(), ("zoh", "linear"), 0.0,
+            np.zeros(2), None,
+        )
 
 
 @pytest.mark.parametrize(("hold", "order"), [("zoh", 1), ("linear", 2)])

@@ -52,6 +52,15 @@ def test_operators_may_be_nested_and_multiplied():
     np.testing.assert_allclose(found, [3 * (z[0] - z[1]), z[3]], atol=1e-10)
 
 
+def test_equal_operators_are_one():
+    texts = ["lp(u*u, 2)", "lp(u*v, 2)", "lp(u*u, 2) + lp(lp(u*u, 2), 2)", "hp(u*v, 2)"]
+    found = regression_from_mapping({
+        "name": "r", "unknowns": {"a": 1}, "signals": {"u": None, "v": None},
+        "Y": texts, "psi": [[1]] * len(texts),
+    })
+    assert [operator.name for operator in found.operators] == ["lp", "lp", "lp", "hp"]
+
+
 def test_a_delay_moves_jumps_exactly():
     (found,) = values("delay(delay(w, 0.7), 1.1)*t", w="step(t - 3.3)*exp(-t)")
     shifted = T - 1.8

@@ -583,6 +583,15 @@ def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):
         run(GROWING, 1.0, remedy="output_injection")
 
 
+def test_filters_that_forget_fast_take_more_stages_than_a_recording_has():
+    """Its elements are not cut for e^{−1000 t}."""
+    mesh = initial_mesh(0.0, 0.2, [], 100, radau_rule(3))
+    rows = Trajectory(mesh, np.full((100, 4, 1, 2), [-500.0, 0.0]))
+    outer = Trajectory(mesh, np.ones((100, 4, 1, 2)))
+    found = filtered(outer, np.zeros(1), np.ones(1), Dynamics(rows, np.ones(1)))
+    assert found.mesh.size < 500
+
+
 @pytest.mark.parametrize("growth", [0.0, 1e3])
 @np.errstate(all="ignore")
 def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elements(

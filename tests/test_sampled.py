@@ -89,6 +89,15 @@ def test_estimates_converge_to_those_in_continuous_time(plant, estimator, hold, 
     assert np.all(np.abs(rates - order) < 0.3), errors
 
 
+def test_the_regression_of_the_paper_has_the_last_rows_at_samples_too():
+    whole, last = (
+        run(shipped("circuit"), {"name": "least_squares"}, 1.0, sample_time=0.1, regression=rows)
+        for rows in ("projected", "paper")
+    )
+    np.testing.assert_array_equal(last.regression.psi, whole.regression.psi[:, -1:])
+    np.testing.assert_array_equal(last.regression.Y, whole.regression.Y[:, -1:])
+
+
 def test_a_turning_kernel_of_e():
     system = plant_from_mapping(ROTATING)
     reference = run(system, {"name": "least_squares"}).estimation.parameters[0, -1]

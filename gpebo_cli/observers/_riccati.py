@@ -211,8 +211,7 @@ def run_filter(
         raise SolverError(f"the Riccati equation of the {name} has no finite solution") from error
     except SolverError as error:
         raise SolverError(
-            f"{error}; the covariance may fall too fast from where it starts: lower observer.P0, "
-            "or raise observer.regularisation or the noise"
+            f"{error}; the covariance may fall too fast from where it starts: {advice}"
         ) from error
     size = np.maximum(np.einsum("kjii->kj", P), np.finfo(float).tiny)
     relative = np.linalg.eigvalsh(P)[..., 0] / size
@@ -220,8 +219,7 @@ def run_filter(
         t = solution.trajectory.mesh.points.flat[np.argmax(relative < -_INDEFINITE)]
         raise SolverError(
             f"the covariance of the {name} is not positive semidefinite near t = {t:.6g} "
-            f"(eigenvalue {relative.min():.1e} of its trace); lower observer.P0, or raise "
-            "observer.regularisation"
+            f"(eigenvalue {relative.min():.1e} of its trace); {advice}"
         )
     mesh = solution.trajectory.mesh
     kinds = followed(estimate, solution.extras)
@@ -275,8 +273,7 @@ def _error(
         replace(problem, monitor=None, told=True), mesh, tol=np.inf, max_elements=mesh.size
     )
     values = finer.trajectory.values
-    at = found(mesh.points.ravel(), mesh.inside.ravel()).reshape(values.shape)
-    (P, estimate), (other, same) = quotient(values), quotient(at)
+    (P, estimate), (other, same) = quotient(values), quotient(mesh.along(found).values)
     d = _deviations(P)
     error = float((np.abs(other - P) / (d[:, None, :, None] * d[:, None, None, :])).max())
     kinds = zip(followed(estimate, finer.extras), followed(same, finer.extras), strict=True)

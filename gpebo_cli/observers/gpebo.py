@@ -73,27 +73,30 @@ class Gpebo:
     def __post_init__(self) -> None:
         if self.sample_time is not None:
             self._refuse_what_needs_the_past()
-        keeps = isinstance(self.remedy, Plain | OutputInjection)
-        if self.bounds and not keeps:
+        if self.bounds and not self._keeps:
             raise ConfigError(
                 "observer.bounds: parameters that change on the way have none; accepted remedies "
                 "are none and output_injection"
             )
-        if self.unknown_initial is not None and not keeps:
+        if self.unknown_initial is not None and not self._keeps:
             raise ConfigError(
                 "observer.unknown_initial: with this remedy the parameters are about later states, "
                 "which are all unknown; accepted remedies are none and output_injection"
             )
 
+    @property
+    def _keeps(self) -> bool:
+        """Whether the parameters are about the start from beginning to end."""
+        return isinstance(self.remedy, Plain | OutputInjection)
+
     def observe(
         self, system: DescriptorSystem, signals: Measurements, solver: SolverSettings
     ) -> Observation:
         """The regression and the state map, with the remedy."""
-        keeps = isinstance(self.remedy, Plain | OutputInjection)
-        lasts = keeps or isinstance(self.remedy, CurrentCoordinates)
+        lasts = self._keeps or isinstance(self.remedy, CurrentCoordinates)
         if not lasts or signals.mesh.size < _LONG or system.n > SMALL or solver.name == "ivp":
             signals = replace(signals, asked=None)
-        if not keeps:
+        if not self._keeps:
             return self._observe(system, signals, solver)
         return lean(
             lambda each: self._observe(system, each, solver), system, signals, solver,
@@ -108,8 +111,9 @@ class Gpebo:
         if self.form != "auto" or self.regression == "paper":
             return self._on(self.form, *arguments)
         plain = isinstance(self.remedy, Plain)
-        found: Observation | ModelError | SolverError
+        found: Observation | None
         known = everything = (True, system.q + system.n)
+        short = signals.mesh.size < _LONG
 
         def few(elements: int) -> SolverSettings:
             return replace(solver, max_elements=min(solver.max_elements, max(_TRIED, elements)))
@@ -120,25 +124,23 @@ class Gpebo:
             if not plain:
                 return self._on("auto", *arguments)
             found = self._on("auto", system, signals, few(100 * signals.mesh.size))
-            short = signals.mesh.size < _LONG
+            limits = few(4 * found.regression.mesh.size)
             if short and not found.note and not _same_on_both_forms(found, system, signals):
                 known = _told(found, system, solver)
             why = "which determines more than the equations as given"
             if not known[0]:
                 why = "which tells with more digits what the equations as given tell, or more"
-        except (ModelError, SolverError) as error:
-            found, known, limits = error, (False, -1), solver
+        except (ModelError, SolverError):
+            found, known, limits = None, (False, -1), solver
             why = "for as given its signals are not resolved"
-        if known < everything and signals.mesh.size < _LONG:
-            if isinstance(found, Observation):
-                limits = few(4 * found.regression.mesh.size)
+        if known < everything and short:
             try:
                 other = self._on("strangeness_free", system, signals, limits, _NOTE.format(why))
                 if not plain or _told(other, system, solver) > known:
                     return other
             except GpeboError:  # the form does not exist, or not for these signals
                 pass
-        return found if isinstance(found, Observation) else self._on("auto", *arguments)
+        return self._on("auto", *arguments) if found is None else found
 
     def _on(
         self, form: str, system: DescriptorSystem, signals: Measurements, solver: SolverSettings,
@@ -209,8 +211,7 @@ def _told(
 ) -> tuple[bool, int]:
     """Whether it is told with some digits, and how many unknowns and states are at the end."""
     regression, state_map = found.regression, found.state_map
-    if not isinstance(state_map, AffineStateMap):
-        return False, 0
+    assert isinstance(state_map, AffineStateMap)  # noqa: S101  as it is without a remedy
     ends = regression.mesh.edges[1:]
     last, steady = len(ends) - 1, found.growth is None or found.growth < _BLOWN
     known = known_at(regression, ends[-1:], solver.tol)

@@ -33,6 +33,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.uncertainty import noise_level
 from gpebo_cli.findings import Assumption, Requirement
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
@@ -78,7 +79,7 @@ class FilterModel:
     A: Array  # (N, n, n) of ζ
     b: Array  # (N, n)
     c: Array  # (N, e + r, n)
-    terms: Array  # (N, e + r, n)
+    terms: Array  # (N or 1, e + r, n)
     rows: Array  # (N, e + r, r) Z
     g_y: Array  # (N, e + r)
     from_noise: Array  # (N, n, m + r) Γ
@@ -86,38 +87,38 @@ class FilterModel:
     offset: Array  # (N, states) x_y
     gain: Array  # (N, states, n) [X_θ, X_w]
     direct: Array  # (N, states, m + r) of ν in x_y
-    projector: Array  # (N, states, states) P
+    inside: Array  # (N or 1, n, n) diag(I, P)
+    steps: Array | float = 1.0  # (N,) seconds between samples over the noise's sample time
 
 
-def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> FilterModel:
+def filter_model(
+    o: ObserverMatrices, signals: Array, form: EquationForm, steps: Array | float = 1.0
+) -> FilterModel:
     """The linear system of the filter, w in coordinates of the observer's basis.
 
-    Matrices are those at N times, signals are [v; y] (N, v + r, 1).
+    Matrices are those at N times, signals are [v; y] (N, v + r, 1), and ``steps`` as in the model.
     """
-    count, r, basis, dual = len(signals), o.outputs, o.split.basis, o.split.dual
+    count, r, basis = len(signals), o.outputs, o.split.basis
     q, k = o.from_unknowns.shape[2], basis.shape[1]
     A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
-    off = np.eye(k) - dual @ o.split.projector @ basis
+    inside = _inside(q, o.split)
     own = units_along(basis, form.units.states)
     rate = np.linalg.norm(o.dynamics * own / own[:, None], axis=(1, 2))
-    damping = rate[:, None, None] * off
+    damping = rate[:, None, None] * (np.eye(k) - inside[:, q:, q:])
     A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
     inward = np.zeros((count, q + k, signals.shape[1]))
     inward[:, q:] = o.from_signals
     g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
-    algebraic = o.algebraic @ basis  # 𝒜 B
-    c = np.empty((count, g.shape[1], q + k))
-    c[:, :, :q], c[:, :, q:] = o.G, algebraic
-    terms = np.abs(c)
-    terms[:, :, q:] = np.abs(o.algebraic) @ np.abs(basis)
+    c = joined(o.G, o.on_basis, axis=2)
+    c = np.broadcast_to(c, (count, *c.shape[1:]))
+    terms = joined(np.abs(o.G), np.abs(o.algebraic) @ np.abs(basis), axis=2)
     K_g, K_c = (np.asarray(o.elimination @ (transpose(o.range) @ x)) for x in (g, c))
     gain = -K_c  # [X_θ, X_w B] = [−K G, B − K 𝒜 B]
     gain[:, :, q:] += basis
     if form.structure is not None:
         # Outputs take no part in the elimination, and the constraints have been used up for w.
-        Z = np.zeros((1, g.shape[1], r))
-        Z[0, g.shape[1] - r :] = np.eye(r)
+        Z = np.eye(g.shape[1])[None, :, -r:]
     else:
         # The residual's r rows: of its n rows with Π, those in the range of E are zero.
         L = o.split.equations
@@ -141,14 +142,15 @@ def filter_model(o: ObserverMatrices, signals: Array, form: EquationForm) -> Fil
         offset=-(K_g @ signals)[:, :, 0],
         gain=gain,
         direct=-o.of_noise(K_g, m),
-        projector=np.broadcast_to(o.split.projector, (count, *o.split.projector.shape[1:])),
+        inside=inside,
+        steps=steps,
     )
 
 
-def _inside(q: int, split: Split, P: Array) -> Array:
+def _inside(q: int, split: Split) -> Array:
     """diag(I, P) in coordinates of ζ, (N, n, n)."""
-    moving = split.dual @ P @ split.basis
-    inside = np.zeros((len(P), q + moving.shape[1], q + moving.shape[1]))
+    moving = split.dual @ split.projector @ split.basis
+    inside = np.zeros((len(moving), q + moving.shape[1], q + moving.shape[1]))
     inside[:, :q, :q], inside[:, q:, q:] = np.eye(q), moving
     return inside
 
@@ -161,16 +163,11 @@ class NoiseModel:
     process: Array  # (n,)
     exact: Array  # (n,)
 
-    def measured(
-        self, s: FilterModel, steps: Array | float = 1.0
-    ) -> tuple[Array, Array, BoolArray]:
-        """S Dᵀ (N, m + r, r), V (N, r, r), and in which directions (N, r) V was regularised.
-
-        ``steps`` (N,) are those between samples, relative to the sample time.
-        """
+    def measured(self, s: FilterModel) -> tuple[Array, Array, BoolArray]:
+        """S Dᵀ (N, m + r, r), V (N, r, r), and in which directions (N, r) V was regularised."""
         Zt = transpose(s.rows)
         D = Zt @ s.in_measurement
-        SDt = self.signals[:, None] * np.reshape(steps, (-1, 1, 1)) * transpose(D)
+        SDt = self.signals[:, None] * np.reshape(s.steps, (-1, 1, 1)) * transpose(D)
         size = s.terms @ self.exact
         # A row without terms is as exact as the largest one.
         largest = size.max(axis=1, keepdims=True)
@@ -182,23 +179,17 @@ class NoiseModel:
         L = L @ U
         return SDt, (L * (values + exact)[:, None]) @ transpose(L), exact
 
-    def state_space(
-        self, s: FilterModel, q: int, split: Split, steps: Array | float = 1.0
-    ) -> StateSpace:
-        """The model with its covariances, one column of signals, w in the basis of a split.
-
-        ``steps`` (N,) are as in :meth:`measured`.
-        """
+    def state_space(self, s: FilterModel) -> StateSpace:
+        """The model with its covariances, one column of signals."""
         Zt = transpose(s.rows)
-        SDt, V, _ = self.measured(s, steps)
+        SDt, V, _ = self.measured(s)
         c = Zt @ s.c
         c[np.abs(c) <= _ROUNDING * (np.abs(Zt) @ np.sqrt(s.terms))] = 0.0
-        signals = self.signals * np.reshape(steps, (-1, 1, 1))
+        signals = self.signals * np.reshape(s.steps, (-1, 1, 1))
         Q = (s.from_noise * signals) @ transpose(s.from_noise)
         if self.process.any():
             # w stays in the range of P(t), and so does what drives it.
-            inside = _inside(q, split, s.projector)
-            Q = Q + (inside * self.process) @ transpose(inside)
+            Q = Q + (s.inside * self.process) @ transpose(s.inside)
         return StateSpace(
             A=s.A, b=s.b[:, :, None], c=c, z=-(Zt @ s.g_y[:, :, None]), Q=Q,
             N=s.from_noise @ SDt, V=V,
@@ -246,13 +237,13 @@ class KalmanBucy:
         noise, level = _noise(signals, system, evidence)
         note = known.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
         unknown = noise.rows is not None and not noise.variances.any()
-
         steps = _steps(noise, mesh)
 
         def reduced(t: Array, inside: Array) -> FilterModel:
-            return filter_model(known.matrices(t, inside), known.measured(t, inside), known.form)
+            o, driving = known.matrices(t, inside), known.measured(t, inside)
+            return filter_model(o, driving, known.form, steps(inside))
 
-        names = (*system.unknowns, *(f"w_{label}" for label in known.labels))
+        names = (*system.unknowns, *known.labels)
         if not (system.unknowns or known.begin.names):
             raise ConfigError(
                 f"plant {system.name} has neither unknowns nor states that its constraints leave "
@@ -261,7 +252,6 @@ class KalmanBucy:
         start = np.concatenate([np.zeros(q), split.dual @ known.xi_a])
         variances = per_name(self.P0, names, "estimate", "observer.P0", absent=_INITIAL_VARIANCE)
         P0 = _initial_covariance(variances, known)
-        process = per_name(self.process, names, "estimate", "observer.process", absent=0.0)
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
         of_states = known.form.units.states, known.form.units.states[:, None] / sizes
@@ -269,10 +259,11 @@ class KalmanBucy:
             (variances / sizes**2).max(initial=0.0) or 1.0
         ))
         model_noise = NoiseModel(
-            noise.variances * noise.sample_time, process,
+            noise.variances * noise.sample_time,
+            per_name(self.process, names, "estimate", "observer.process", absent=0.0),
             self.regularisation**2 * noise.sample_time * varies,
         )
-        fastest, offsets, regularised = _largest(reduced, windows, model_noise, steps, sizes)
+        fastest, offsets, regularised = _largest(reduced, windows, model_noise, sizes)
         # What w is beside the part of x that is known may be rounding of that, added up.
         turns = 1.0 + fastest * float(mesh.edges[-1] - mesh.edges[0])
         beside = turns * np.abs(split.dual) @ offsets
@@ -280,22 +271,21 @@ class KalmanBucy:
 
         def model(t: Array, inside: Array) -> tuple[StateSpace, tuple[Array, ...]]:
             s = reduced(t, inside)
-            space = model_noise.state_space(s, q, split, steps(inside))
-            return space, (s.offset, s.gain, s.direct)
+            return model_noise.state_space(s), (s.offset, s.gain, s.direct)
 
         def monitor(estimate: Array, extras: tuple[Array, ...]) -> list[tuple[Array, float]]:
             offset, gain = (e / units for e, units in zip(extras, of_states, strict=False))
             x = offset + np.einsum("ksij,ksj->ksi", gain, estimate[..., 0] / sizes)
             return [(x, 0.0), (gain.reshape(*gain.shape[:2], -1), 0.0)]
 
-        used: dict[str, float | int | str | None] = {
-            f"intensity_{name}": float(value)
-            for name, value in zip((*system.inputs, *system.outputs), model_noise.signals,
-                                   strict=True)
-        }
-        share = f"{self.regularisation:g} of each equation's own under P0 "
+        intensities = (f"intensity_{name}" for name in (*system.inputs, *system.outputs))
+        used: dict[str, float | int | str | None] = dict(
+            zip(intensities, model_noise.signals.tolist(), strict=True)
+        )
         if regularised:
-            used["regularised_with"] = f"noise of {share}at {noise.sample_time:g} s"
+            share = f"{self.regularisation:g} of each equation's own under P0"
+            used["regularised_with"] = f"noise of {share} at {noise.sample_time:g} s"
+            note += f"; measurement noise regularised: {share} (observer.regularisation)"
         parts = filter_windows(
             model, start[:, None], P0, windows, tol=solver.tol, max_elements=solver.max_elements,
             monitor=monitor, floor=floor, sizes=sizes,
@@ -304,12 +294,12 @@ class KalmanBucy:
         filtered = next(parts) if len(windows) == 1 else _kept(parts, mesh, signals.wanted)
         if few is not None:
             filtered = _along_all(filtered, signals, few, solver, lambda t, inside: _errors(
-                reduced(t, inside), filtered.at(t, inside)[0], model_noise, steps(inside), q, split
+                reduced(t, inside), filtered.at(t, inside)[0], model_noise
             ))
         offset, gain, direct = filtered.extras
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
-            m = model_noise.state_space(reduced(t, inside), q, split, steps(inside))
+            m = model_noise.state_space(reduced(t, inside))
             return m.A * sizes / sizes[:, None], sizes[:, None] * sizes * (
                 transpose(m.c) @ np.linalg.solve(m.V, m.c)
             )
@@ -343,9 +333,8 @@ class KalmanBucy:
             estimator=Filter(filtered, observability),
             names=names,
             # A drift of the estimates is no constant that would explain all of the data.
-            evidence=None if any(process) else evidence,
-            note=note
-            + f"; measurement noise regularised: {share}(observer.regularisation)" * regularised,
+            evidence=None if model_noise.process.any() else evidence,
+            note=note,
         )
 
 
@@ -354,9 +343,10 @@ OBSERVER = KalmanBucy
 
 def _told(level: float, inside: Sequence[str]) -> str:
     """A ``level`` of noise from the residual, and whose noise is ``inside`` matrices, with "; "."""
-    told = f"; noise of the outputs taken from the residual, {level:.2g}" * (level > 0.0)
-    told += "; deviations know nothing of the noise of " * bool(inside) + ", ".join(inside)
-    return told + " in the matrices" * bool(inside)
+    told = f"; noise of the outputs taken from the residual, {level:.2g}" if level > 0.0 else ""
+    if inside:
+        told += f"; deviations know nothing of the noise of {', '.join(inside)} in the matrices"
+    return told
 
 
 def _noise(
@@ -401,24 +391,21 @@ def _steps(noise: SignalNoise, mesh: Mesh) -> Callable[[Array], Array | float]:
 
 def _largest(
     model: Callable[[Array, Array], FilterModel], windows: Sequence[Mesh], noise: NoiseModel,
-    steps: Callable[[Array], Array | float], sizes: Array,
+    sizes: Array,
 ) -> tuple[float, Array, bool]:
     """Largest of A in units of ``sizes`` (n,), of offsets (states,); whether V is regularised."""
     fastest, offsets, regularised = 0.0, np.zeros(1), False
     for window in windows:
-        inside = window.inside.ravel()
-        s = model(window.points.ravel(), inside)
+        s = model(window.points.ravel(), window.inside.ravel())
         fastest = max(fastest, float(np.abs(s.A * sizes / sizes[:, None]).max()))
         offsets = np.maximum(offsets, np.abs(s.offset).max(axis=0))
-        regularised |= bool(noise.measured(s, steps(inside))[2].any())
+        regularised |= bool(noise.measured(s)[2].any())
     return fastest, offsets, regularised
 
 
-def _errors(
-    s: FilterModel, P: Array, noise: NoiseModel, steps: Array | float, q: int, split: Split
-) -> ErrorSystem:
+def _errors(s: FilterModel, P: Array, noise: NoiseModel) -> ErrorSystem:
     """What errors of the signals do to ζ̂ and to the state's offset, with P (N, n, n)."""
-    m = noise.state_space(s, q, split, steps)
+    m = noise.state_space(s)
     transposed = np.linalg.solve(m.V, transpose(np.asarray(P @ transpose(m.c) + m.N)))
     L = transpose(np.asarray(transposed, dtype=np.float64))
     inward = L @ transpose(s.rows) @ s.in_measurement - s.from_noise
@@ -481,9 +468,9 @@ def _uniform_observability(
 
     It is that in the directions that ζ has.
     """
-    P = known.matrices(windows.starts, windows.starts).split.projector
     n, q = len(P0), known.system.q
-    inside = _inside(q, known.first.split, P) * sizes / sizes[:, None]
+    split = known.matrices(windows.starts, windows.starts).split
+    inside = _inside(q, split) * sizes / sizes[:, None]
     scale = np.sqrt(np.diag(P0)) / sizes
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
     M = scale[:, None] * (inside @ windows.gramians @ inside) * scale

@@ -130,10 +130,8 @@ class GivenAtSamples:
         none = np.zeros((count, self.text.system.n, len(self.parameters)))
         errors = None
         if self.text.Y is None:
-            o = _errors_of_outputs(self.text.system, self.text.rows)(t, t)
-            whole = (np.broadcast_to(part, (count, *part.shape[1:])) for part in (o.C, o.D))
-            errors = ErrorSteps(np.zeros((count, 0, 2 * o.D.shape[2])), *whole)
-
+            of_outputs = _errors_of_outputs(self.text.system, self.text.rows)(t, t)
+            errors = ErrorSteps.at(np.zeros((count, 0, 2 * (u.shape[1] + y.shape[1]))), of_outputs)
         return state, SampledBlock(
             regression, none[:, :, 0], none, none[:, :0], errors,
             fit=None if S is None else S.fit,

@@ -246,8 +246,5 @@ def _over(
         advice=_ADVICE,
     )
     rhs = solve(problem, omega.mesh, tol=TOLERANCE, max_elements=_MAX_ELEMENTS).trajectory
-    t, inside = rhs.mesh.points.ravel(), rhs.mesh.inside.ravel()
-    both = np.concatenate(
-        [omega(t, inside).reshape(-1, p, p), rhs.values.reshape(-1, p, 1)], axis=2
-    )
-    return rhs.mesh.trajectory(both)
+    found = rhs.mesh.along(omega).values.reshape(*rhs.values.shape[:2], p, p)
+    return Trajectory(rhs.mesh, np.concatenate([found, rhs.values], axis=3))

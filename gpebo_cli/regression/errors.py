@@ -66,6 +66,13 @@ class ErrorSteps(NamedTuple):
     C: Array  # (K, O, S)
     D: Array  # (K, O, I)
 
+    @classmethod
+    def at(cls, step: Array, system: ErrorSystem) -> ErrorSteps:
+        """With the outputs of a system at the samples."""
+        return cls(step, *(
+            np.broadcast_to(part, (len(step), *part.shape[1:])) for part in (system.C, system.D)
+        ))
+
 
 class ErrorRecursion(NamedTuple):
     """The same of an estimator: s' = A s + old δY + new δY', δη̂ = C s'."""

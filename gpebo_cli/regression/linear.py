@@ -13,7 +13,7 @@ import numpy as np
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.linalg import triangular
+from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import TOLERANCE, Dynamics, filtered, state_of
@@ -22,7 +22,7 @@ from gpebo_cli.regression.resets import ExtensionState, Known, Reset, level_of
 
 _MANY = 16  # parameters, from which on G at the end is made without those at all other points
 _SINGULAR = 1e-10  # singular values of ψ with columns of equal size that count as zero, relatively
-_WINDOW = 1 << 12  # elements at most, and
+_WINDOW = 1 << 12  # elements of a window at most, and
 _ROUNDING = 100.0 * float(np.finfo(float).eps)  # times s²: what rounding at nodes is between them
 _AT_ONCE = 1 << 22  # numbers of [ψᵀψ | ψᵀY] at most, that are made at once of a long regression
 
@@ -242,8 +242,10 @@ class LinearRegression:
         if not self.long:
             yield self
             return
-        for first in range(0, self.mesh.size, self._window):
-            last = min(first + self._window, self.mesh.size)
+        each = max(1, len(self.mesh.rule.points) * self.p * (self.p + 1))
+        count = max(1, min(_WINDOW, _AT_ONCE // each))
+        for first in range(0, self.mesh.size, count):
+            last = min(first + count, self.mesh.size)
             yield replace(self._part(first, last), whole=self)
 
     @property
@@ -251,12 +253,6 @@ class LinearRegression:
         """Whether there are several windows."""
         plain = not (self.resets or self.realisations)
         return plain and self.mesh.size > _WINDOW
-
-    @property
-    def _window(self) -> int:
-        """Elements in a window."""
-        each = len(self.mesh.rule.points) * self.p * (self.p + 1)
-        return max(1, min(_WINDOW, _AT_ONCE // max(1, each)))
 
     def _part(self, first: int, last: int) -> LinearRegression:
         """The elements from one number to another, without what was before."""
@@ -291,7 +287,7 @@ def outer_products(psi: Array, Y: Array) -> Array:
     """[ψᵀψ | ψᵀY] of shape (..., p, p + c) from ψ (..., rows, p) and Y (..., rows[, c])."""
     Y = with_realisations(psi, Y)
     both = np.concatenate([psi, Y], axis=-1)
-    return np.asarray(np.swapaxes(psi, -1, -2) @ both)
+    return np.asarray(transpose(psi) @ both)
 
 
 def with_realisations(psi: Array, Y: Array) -> Array:

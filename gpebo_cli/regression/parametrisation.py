@@ -20,6 +20,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.model.expressions import Bounds, Tape
 from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.schema import number, shown
 
 _ROUNDS = 60  # of Levenberg and Marquardt
@@ -86,8 +87,8 @@ class Parametrisation:
             with np.errstate(invalid="ignore"):  # ends may be infinite
                 middle, radius = T @ ends.mean(axis=0), np.abs(T) @ (0.5 * np.ptp(ends, axis=0))
             known = np.isfinite(radius).all(axis=(1, 2))
-            symmetric = np.where(known[:, None, None], middle + np.swapaxes(middle, 1, 2), 0.0)
-            spread = (radius + np.swapaxes(radius, 1, 2)).sum(axis=2).max(axis=1)
+            symmetric = np.where(known[:, None, None], middle + transpose(middle), 0.0)
+            spread = (radius + transpose(radius)).sum(axis=2).max(axis=1)
             eigenvalue = np.linalg.eigvalsh(symmetric)[:, 0]
             done = known & (spread < _SHARP * eigenvalue)
             least = min(least, float((eigenvalue - spread)[done].min(initial=np.inf)))
@@ -96,7 +97,7 @@ class Parametrisation:
                 break
             theta = 0.5 * (low + high)
             slope = T @ self.jacobian(theta)
-            poor = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0] <= 0.0
+            poor = np.linalg.eigvalsh(slope + transpose(slope))[:, 0] <= 0.0
             if poor.any() or len(low) > _CELLS:
                 text = self._place(theta[np.argmax(poor)])
                 what = "is not positive" if poor.any() else "cannot be shown to be positive"
@@ -161,7 +162,7 @@ def _root(weight: Array) -> Array:
     values, vectors = np.linalg.eigh(weight)
     size = np.maximum(values[:, -1:], np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(values / size, _UNSEEN))  # η̂ says at least something
-    return np.asarray(scale[..., None] * np.swapaxes(vectors, -1, -2))
+    return np.asarray(scale[..., None] * transpose(vectors))
 
 
 def read_box(given: object, names: tuple[str, ...], where: str) -> tuple[Array, Array]:

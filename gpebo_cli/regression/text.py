@@ -265,17 +265,11 @@ class _Operators:
             raise nodes.FoldError(f"{name}: {what} must be a positive number")
         if argument.derivatives:
             raise nodes.FoldError(f"{name}: d(.) cannot stand inside; use hp for a derivative")
-        key = (name, _structure(argument), number.value)
-        if key not in self.found:
-            tape = record([Expression(argument, name, f"argument of {name}")], self._signals)
-            self.found[key] = Operator(name, tape, number.value)
+        tape = record([Expression(argument, name, f"argument of {name}")], self._signals)
+        key = (name, tape.instructions, number.value)
+        self.found.setdefault(key, Operator(name, tape, number.value))
         place = len(self._signals) + list(self.found).index(key)
         return nodes.signal(f"{name}(…)", place)
-
-
-def _structure(node: Node) -> tuple[object, ...]:
-    """Equal for equal expressions."""
-    return (node.operation, node.value, *map(_structure, node.arguments))
 
 
 def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> TextRegression:

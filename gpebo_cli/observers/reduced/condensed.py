@@ -21,6 +21,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import AffineStateMap, InitialError, Measurements, Observation
@@ -41,45 +42,14 @@ def lean(
 ) -> Observation:
     """What ``observe`` finds along the signals, by way of :func:`thinned` ones if there are any.
 
-    The state map may be asked for at all ``rows``.
+    The regression found along these has no resets and is affine in the signals, and so is the
+    state, which then is known at the long elements' points, or instead at their ends and at all
+    ``rows`` of the signals.
     """
     few = thinned(system, signals, solver)
     if few is None:
         return observe(signals)
-    return condensed(observe(few), signals, few, solver, rows=rows)
-
-
-def thinned(
-    system: DescriptorSystem, signals: Measurements, solver: SolverSettings
-) -> Measurements | None:
-    """Straight lines between the signals at the wanted times, and where the plant's matrices jump.
-
-    None: there are hardly more samples than that, or Y is not affine in them.
-    """
-    wanted = signals.wanted
-    if wanted is None or signals.mesh.size < _MANY * len(wanted):
-        return None
-    if system.coefficients.signals or signals.derivatives is not None:
-        return None
-    start, stop = signals.span
-    ends = np.unique(np.concatenate([[start], wanted, [stop]]))
-    cuts = system.coefficients.breakpoints(start, stop)
-    mesh = Mesh(edges(ends, cuts), radau_rule(solver.stages))
-    at = signals.at(mesh.edges)
-    both = at[:-1, None] + mesh.rule.points[:, None] * np.diff(at, axis=0)[:, None]
-    u, y = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
-    return replace(signals, inputs=u, outputs=y, wanted=None, asked=None)
-
-
-def condensed(
-    found: Observation, signals: Measurements, few: Measurements, solver: SolverSettings, *,
-    rows: bool = False,
-) -> Observation:
-    """What is ``found`` along ``few`` signals, those of :func:`thinned`, along all of them.
-
-    Its regression has no resets and is affine in the signals, and so is the state, which is known
-    at the long elements' points, or instead at their ends and at all ``rows`` of the signals.
-    """
+    found = observe(few)
     regression, state_map, errors = found.regression, found.state_map, found.errors
     extension = found.truth.extension if isinstance(found.truth, InitialError) else None
     if errors is None or not (
@@ -124,6 +94,28 @@ def condensed(
         ),
         state_map=state_map,
     )
+
+
+def thinned(
+    system: DescriptorSystem, signals: Measurements, solver: SolverSettings
+) -> Measurements | None:
+    """Straight lines between the signals at the wanted times, and where the plant's matrices jump.
+
+    None: there are hardly more samples than that, or Y is not affine in them.
+    """
+    wanted = signals.wanted
+    if wanted is None or signals.mesh.size < _MANY * len(wanted):
+        return None
+    if system.coefficients.signals or signals.derivatives is not None:
+        return None
+    start, stop = signals.span
+    ends = np.unique(np.concatenate([[start], wanted, [stop]]))
+    cuts = system.coefficients.breakpoints(start, stop)
+    mesh = Mesh(edges(ends, cuts), radau_rule(solver.stages))
+    at = signals.at(mesh.edges)
+    both = at[:-1, None] + mesh.rule.points[:, None] * np.diff(at, axis=0)[:, None]
+    u, y = (Trajectory(mesh, part) for part in np.split(both, [system.m], axis=2))
+    return replace(signals, inputs=u, outputs=y, wanted=None, asked=None)
 
 
 def beyond(
@@ -199,7 +191,7 @@ def _projected(signal: Trajectory, mesh: Mesh, part: slice) -> Array:
     place = (fine.points[:, 1:] - mesh.edges[whole, None]) / mesh.steps[whole, None]
     weights = fine.steps[:, None] * fine.rule.integration[-1]
     by_degree = weights[..., None] * legendre.legvander(2.0 * place - 1.0, s - 1)
-    moments = np.swapaxes(by_degree, 1, 2) @ signal.values[:, 1:]
+    moments = transpose(by_degree) @ signal.values[:, 1:]
     firsts = np.searchsorted(whole, np.arange(part.start, part.stop))
     moments = np.add.reduceat(moments, firsts) / mesh.steps[part, None, None]
     basis = legendre.legvander(2.0 * mesh.rule.points - 1.0, s - 1)

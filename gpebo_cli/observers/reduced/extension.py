@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import repeat
 from typing import Any
 
 import numpy as np
 
 from gpebo_cli.errors import SolverError
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.errors import EPS, ROUNDING
@@ -23,6 +22,7 @@ from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMat
 from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
     Assembled,
+    largest_at,
     regression_signals,
     resolve,
     term_sizes,
@@ -59,16 +59,18 @@ class Extension:
             return mesh.trajectory(found.offset), mesh.trajectory(found.gain)
         return mesh.sampled(self.asked, found.offset), mesh.sampled(self.asked, found.gain)
 
+    def rows(self, kept: IntArray) -> tuple[Trajectory, Trajectory]:
+        """Y (rows,) and ψ (rows, p) of the rows that are ``kept`` (rows,)."""
+        found = self.assembled
+        some = slice(None) if len(kept) == found.Y.shape[1] else kept  # a slice copies nothing
+        return self.mesh.trajectory(found.Y[:, some]), self.mesh.trajectory(found.psi[:, some])
+
     def kept_at(self, t: Array) -> Extension:
-        """The same with the state's offset and gain at the times t (M,) only, and z at the ends."""
-        sampler, (first, stop) = self.mesh.sampler(t), self.mesh.span
+        """The same with the state's offset and gain at the times t (M,) only."""
+        sampler = self.mesh.sampler(t)
         offset, gain = (sampler(signal.values) for signal in self.state_map)
-        z = self.trajectory.values
-        ends = self.mesh.sampled(np.array([first, stop]), np.stack([z[0, 0], z[-1, -1]]))
         return replace(
-            self, trajectory=ends, asked=t, assembled=replace(
-                self.assembled, offset=offset, gain=gain
-            ),
+            self, asked=t, assembled=replace(self.assembled, offset=offset, gain=gain)
         )
 
     def growth(self, q: int) -> tuple[float, float]:
@@ -96,19 +98,18 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     plain = bool((units == 1.0).all())
 
     def equations(o: ObserverMatrices, signals: Array) -> LinearEquation:
-        f, seen = o.forcing(signals, 1 + q if large else columns), o.equations(signals)
-        if plain:
-            return LinearEquation(None, o.dynamics, f, seen)
-        A = o.dynamics * of_rows / of_rows[:, None]
-        return LinearEquation(None, A, f / units[:, : f.shape[2]], seen)
+        A, f = o.dynamics, o.forcing(signals, 1 + q if large else columns)
+        if not plain:
+            A, f = A * of_rows / of_rows[:, None], f / units[:, : f.shape[2]]
+        return LinearEquation(None, A, f, o.equations(signals))
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
         return equations(reduced.matrices(t, inside), reduced.measured(t, inside))
 
     name = f"observer of plant {system.name}"
     # Along axes offset and gain are these components, each compared with its own state's size.
-    on_axes = bool((np.abs(basis).sum(axis=0) == np.abs(basis).max(axis=0)).all())
-    on_axes &= basis.shape[1] == reduced.first.split.rank  # else they lose what is eliminated
+    # Where the kernel turns, they lose what is eliminated.
+    on_axes = bool(np.count_nonzero(basis) == basis.shape[1] == reduced.first.split.rank)
     axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
     monitor = _Monitor(reduced, units, axes)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
@@ -121,13 +122,13 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
         known = equations(reduced.first, measured(reduced.form, points, inside, u, y))
     marched = series.solve_dense(problem, mesh, **limits, known=known) if large else None
     if marched is not None:
-        return _assembled(reduced, _in_units(marched, units), monitor.latest, as_found=True)
+        return _assembled(reduced, units, marched, monitor.latest, as_found=True)
     known, large, monitor.axes = None if large else known, False, None
     if len(windows) > 1:
-        return joined(_over(mesh, reduced, problem, monitor))
+        return joined(kept_of(_over(mesh, reduced, problem, monitor), mesh, signals.asked))
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
     solution = own(problem, mesh, **limits)
-    return _assembled(reduced, _in_units(solution, units), monitor.latest, as_found=False)
+    return _assembled(reduced, units, solution, monitor.latest, as_found=False)
 
 
 class _Monitor:
@@ -175,7 +176,7 @@ class _Monitor:
     def next_window(self, size: int) -> Assembled:
         """What is made of the window of that size, which comes to stand before the next one."""
         K, points = self._whole[0].shape[:2]
-        where = self.latest.largest_at(points)
+        where = largest_at(v.reshape(K, points, v[0].size) for v, _ in self.latest.kinds())
         self._past = [e if e.shape[:2] == (1, 1) else e[where] for e in self._whole]
         return self.latest.after((K - size) * points)
 
@@ -184,9 +185,8 @@ def _over(
     mesh: Mesh, reduced: ReducedSystem, problem: LinearProblem, monitor: _Monitor
 ) -> Iterator[Extension]:
     """The extension on one window after the other, so that little is held beside the result."""
-    solver, units, asked = reduced.solver, monitor.units, reduced.signals.asked
-    shares: Iterable[Array] = repeat(mesh.edges) if asked is None else mesh.shares(asked)
-    for window, own in zip(mesh.windows(), shares, strict=False):
+    solver = reduced.solver
+    for window in mesh.windows():
         solution = solve(problem, window, tol=solver.tol, max_elements=solver.max_elements)
         values = solution.trajectory.values
         problem = replace(
@@ -194,8 +194,20 @@ def _over(
             floor=np.maximum(problem.floor, largest_over_time(values, 2)),
         )
         found = monitor.next_window(len(values))
-        part = _assembled(reduced, _in_units(solution, units), found, as_found=False)
-        yield part if asked is None else part.kept_at(own)
+        part = _assembled(reduced, monitor.units, solution, found, as_found=False)
+        everywhere = reduced.signals.asked is None
+        yield part if everywhere else replace(part, trajectory=_ends(part.trajectory))
+
+
+def _ends(signal: Trajectory) -> Samples:
+    """The signal of which nothing but both ends is kept."""
+    first, last = signal.values[0, 0], signal.values[-1, -1]
+    return signal.mesh.sampled(np.array(signal.mesh.span), np.stack([first, last]))
+
+
+def kept_of(parts: Iterator[Extension], mesh: Mesh, asked: Array | None) -> Iterator[Extension]:
+    """What is kept of parts on a mesh's windows: all, or the state map at times ``asked`` (M,)."""
+    return parts if asked is None else map(Extension.kept_at, parts, mesh.shares(asked))
 
 
 def joined(parts: Iterable[Extension]) -> Extension:
@@ -217,10 +229,10 @@ def joined(parts: Iterable[Extension]) -> Extension:
                      found.largest, found.moving, part.mesh.edges[0]))
     errors, weak, of_Y, of_columns, largest, moving, starts = zip(*rest, strict=True)
     mesh = Mesh(np.append(starts[0], over_time.pop("edges")), part.mesh.rule)
-    z, scale, asked = over_time.pop("z"), over_time.pop("scale"), over_time.pop("asked", None)
+    z = Trajectory(mesh, over_time.pop("z"))
+    scale, asked = over_time.pop("scale"), over_time.pop("asked", None)
     return Extension(
-        mesh.sampled(np.array(mesh.span), np.stack([z[0, 0], z[-1, -1]]))
-        if isinstance(part.trajectory, Samples) else Trajectory(mesh, z), max(errors),
+        _ends(z) if isinstance(part.trajectory, Samples) else z, max(errors),
         replace(
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
@@ -230,13 +242,17 @@ def joined(parts: Iterable[Extension]) -> Extension:
 
 
 def _assembled(
-    reduced: ReducedSystem, solution: LinearSolution, found: Assembled, *, as_found: bool
+    reduced: ReducedSystem, units: Array, solution: LinearSolution, found: Assembled, *,
+    as_found: bool,
 ) -> Extension:
     """What was found on the mesh, resolved but for ``as_found``, and sizes of its terms.
 
-    These are looked at where each element begins, in its middle and where it ends.
+    These are looked at where each element begins, in its middle and where it ends. The solution's
+    components are in ``units`` (k, columns).
     """
-    system, values = reduced.system, solution.trajectory.values
+    system, mesh, values = reduced.system, solution.trajectory.mesh, solution.trajectory.values
+    if (units != 1.0).any():
+        values = values * units
     K, points = values.shape[:2]
     places = [0, (points - 1) // 2, points - 1]
     scale: list[Array] = []
@@ -255,19 +271,12 @@ def _assembled(
     sizes = np.maximum.accumulate(np.concatenate(scale), axis=0)
     *_, elimination, injectivity = map(_over_time, solution.extras)
     smallest, where = weakest(injectivity, elimination)
-    at = float(solution.trajectory.mesh.points.ravel()[where])
+    at = float(mesh.points.ravel()[where])
     error, rounding = solution.error_estimate, reduced.first.rounding
     if rounding is not None:
         error = max(error, found.lost(EPS * rounding))
-    return Extension(solution.trajectory, error, found, sizes, reduced.units, (smallest, at))
-
-
-def _in_units(solution: LinearSolution, units: Array) -> LinearSolution:
-    """A solution whose components are multiplied by their units (k, columns)."""
-    found = solution.trajectory
-    if (units == 1.0).all():
-        return solution
-    return replace(solution, trajectory=Trajectory(found.mesh, found.values * units))
+    trajectory = Trajectory(mesh, values)
+    return Extension(trajectory, error, found, sizes, reduced.units, (smallest, at))
 
 
 def _over_time(signal: Array) -> Array:

@@ -56,11 +56,10 @@ def invariant_observer(
         )
     K = o.elimination[0] @ o.range[0].T
     basis: Array = o.split.basis
-    names = o.split.coordinates(system.states, used.units.states)
     return Invariant(
         o.dynamics[0],
         np.concatenate([o.from_signals[0], o.from_unknowns[0]], axis=1),
         basis - K @ o.on_basis[0],
         -K @ np.concatenate([o.g_signals[0], o.G[0]], axis=1),
-        tuple(f"w_{name}" for name in names),
+        o.split.coordinates(system.states, used.units.states),
     )

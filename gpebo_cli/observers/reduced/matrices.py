@@ -33,7 +33,6 @@ from gpebo_cli.observers.reduced.split import (
     within_frame,
 )
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
-from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.regression.errors import ErrorSystem
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
@@ -150,27 +149,25 @@ def observer_matrices(
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,), those of the start first.
 
-    Equations and outputs count in the form's units, outputs with √w = ``output_scale`` (r,), else
-    as in ``like``, the matrices of other times, whose basis is kept. A ``frame`` stands in place of
-    theirs. A plant whose matrices follow signals needs [u; y] (N, m + r).
+    Equations and outputs count in the form's units, outputs with √w = ``output_scale`` (r,), and E
+    may have a known ``frame``; or all is as in ``like``, the matrices of other times, whose basis
+    is kept. A plant whose matrices follow signals needs [u; y] (N, m + r).
     """
     system, model = form.system, form.equations(t, inside, signals)
     units = form.units
-    if like is not None and output_scale is None:
-        scale = like.output_scale
+    if like is not None:
+        scale, frame = like.output_scale, like.split.frame
     else:
         scale = (np.ones(system.r) if output_scale is None else output_scale) / units.outputs
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
     # Products with axes have no rounding that would have to be found.
-    known = like.split.frame if frame is None and like is not None else frame
-    frame = axes_frame(largest_over_time(model.E)) if like is None and frame is None else known
-    found = None
-    if plain and frame is not None and frame.remaining is None and frame.axes:
-        found = _in_frame(model, units.equations, scale, frame, rank_tol)
-    if found is not None:
-        return found
+    axes = axes_frame(largest_over_time(model.E)) if like is None and frame is None else frame
+    if plain and axes is not None and axes.remaining is None and axes.axes:
+        found = _in_frame(model, units.equations, scale, axes, rank_tol)
+        if found is not None:
+            return found
     found = _by_steps(
-        system, model, units, scale, t, rank_tol, like, known,
+        form, model, scale, t, rank_tol, like, frame,
         lambda: form.mass(t, inside, signals, 1)[: len(model.E)],
     )
     held = form.held and model.hidden is not None
@@ -202,11 +199,11 @@ def _in_frame(
 
 
 def _by_steps(
-    system: DescriptorSystem, model: Equations, units: Units, scale: Array, t: Array,
-    rank_tol: float, like: ObserverMatrices | None, frame: Frame | None, slope: Callable[[], Array],
+    form: EquationForm, model: Equations, scale: Array, t: Array, rank_tol: float,
+    like: ObserverMatrices | None, frame: Frame | None, slope: Callable[[], Array],
 ) -> ObserverMatrices:
     """The observer's matrices from those of the plant at the times t (N,) and Ė (N or 1, n, n)."""
-    r = system.r
+    system, units, r = form.system, form.units, form.system.r
     E, A, B, F, C, D, H, hidden = model
     rows = units.equations[:, None]
     if (rows != 1.0).any():
@@ -253,19 +250,8 @@ def _by_steps(
         rounding = (np.abs(K) @ np.abs(of_hidden)).max(axis=0) @ hidden.rounding
     dynamics, from_unknowns, from_signals = _moving(split, A, F, B, Q1, K, on_basis, G, g_signals)
     return ObserverMatrices(
-        split=split,
-        output_scale=scale,
-        dynamics=dynamics,
-        from_unknowns=from_unknowns,
-        from_signals=from_signals,
-        algebraic=algebraic,
-        on_basis=on_basis,
-        g_signals=g_signals,
-        G=G,
-        range=Q1,
-        elimination=K,
-        injectivity=injectivity,
-        rounding=rounding,
+        split, scale, dynamics, from_unknowns, from_signals, algebraic, on_basis, g_signals, G, Q1,
+        K, injectivity, rounding,
     )
 
 

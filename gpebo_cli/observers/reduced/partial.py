@@ -64,8 +64,8 @@ def untouched(
             return None
         left = replace(frame, remaining=Remaining(kept, dual, given_up, int(ranks[0])))
         free = kernel @ transpose(Vt[:, ranks[0] :])
-        drive = within_frame(left, split.pinv).pinv @ A
-        into = drive @ free
+        drive = exact_product(within_frame(left, split.pinv).pinv, A)
+        into = exact_product(drive, free)
         U, sizes, _ = np.linalg.svd(np.moveaxis(into, 1, 0).reshape(len(kept.T), -1), False)
         driven = sizes > _DRIVEN * max(float(np.linalg.norm(drive @ kernel)), TINY)
         if not driven.any():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -54,9 +54,7 @@ class Assembled:
         psi = psi / columns[None].repeat(psi.shape[1], axis=0)
         others: BoolArray = np.ones(len(self.moving), dtype=bool)
         if basis is not None:
-            others[:] = self.eliminated | ~basis.any(axis=1)
-            if others.sum() > len(basis) - basis.shape[1]:
-                others[:] = True
+            others = self.eliminated | ~basis.any(axis=1)
         gain, largest = self.gain, self.moving.copy()
         if not others.all():
             gain = gain[:, others]
@@ -99,13 +97,6 @@ class Assembled:
         """The same without so many of the first times; sizes are still those of all of them."""
         return replace(self, **{name: getattr(self, name)[first:] for name in OVER_TIME})
 
-    def largest_at(self, points: int) -> IntArray:
-        """Elements (W,) of so many points each in which one of the signals is largest."""
-        return np.unique(np.concatenate([
-            np.abs(signal).reshape(-1, points, signal[0].size).max(axis=1).argmax(axis=0)
-            for signal, _ in self.kinds()
-        ]))
-
     def kept_rows(self, system: DescriptorSystem, regression: str) -> IntArray:
         """Rows of the residual that make up the regression."""
         if regression != "paper" and len(self._rows):
@@ -119,6 +110,11 @@ class Assembled:
         in_psi, in_Y = largest_over_time(self.psi), largest_over_time(self.Y)
         large = (in_psi > VANISHING * self.column_scale).any(axis=1)
         return np.flatnonzero(large | (in_Y > VANISHING * self.Y_scale))
+
+
+def largest_at(signals: Iterable[Array]) -> IntArray:
+    """Elements (W,) in which something of the signals (K, s + 1, c) is largest."""
+    return np.unique(np.concatenate([np.abs(v).max(axis=1).argmax(axis=0) for v in signals]))
 
 
 def regression_signals(

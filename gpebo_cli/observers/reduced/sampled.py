@@ -62,8 +62,7 @@ class SampledState:
     """The last sample, and everything that the recursion has to remember of the past."""
 
     t: float
-    u: Array  # (m,)
-    y: Array  # (r,)
+    signals: Array  # (m + r,) [u; y]
     extension: Array  # (k, 1 + q + n_a) [ξ_a | ξ_b | Φ] in the coordinates of the basis
     row: Array  # (rows, p + 1) [ψ | Y]
     scale: Array  # (p,) largest terms of the columns of ψ before cancellation so far
@@ -110,7 +109,7 @@ class SampledObserver(Formulation):
             steps.append(np.eye(len(start), len(start) + 2 * own.shape[1])[None])
         else:
             times = np.concatenate([[state.t], t])
-            signals = np.concatenate([np.append(state.u, state.y)[None], own])
+            signals = np.concatenate([state.signals[None], own])
             start, error = state.extension, state.error_estimate
         if len(times) > 1:
             solution = self._carried(times, signals, start)
@@ -183,25 +182,18 @@ class SampledObserver(Formulation):
         scale = np.maximum.accumulate(scale, axis=0)
         noise = (np.abs(assembled.psi) <= VANISHING * scale[:, None]).all(axis=2, keepdims=True)
         psi = np.where(noise, 0.0, assembled.psi)
-        rows = np.concatenate([psi, assembled.Y[:, :, None]], axis=2)
-        if self.regression == "paper":
-            rows = rows[:, -system.r :]
+        kept = slice(-system.r, None) if self.regression == "paper" else slice(None)
+        rows = np.concatenate([psi, assembled.Y[:, :, None]], axis=2)[:, kept]
         previous, last = (rows[0], t[0]) if before is None else (before.row, before.t)
         state = SampledState(
-            float(t[-1]), signals[-1, : system.m], signals[-1, system.m :], z[-1], rows[-1],
-            scale[-1], growth, log_norm(Phi[-1]), smallest, error,
+            float(t[-1]), signals[-1], z[-1], rows[-1], scale[-1], growth, log_norm(Phi[-1]),
+            smallest, error,
         )
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]),
             of_outputs(self.hold, system.m), scale=scale,
         )
-        errors = None
-        if step is not None:
-            own = slice(-system.r, None) if self.regression == "paper" else slice(None)
-            _, _, C, D = o.errors(own, system.m)
-            errors = ErrorSteps(step, *(
-                np.broadcast_to(each, (len(t), *each.shape[1:])) for each in (C, D)
-            ))
+        errors = None if step is None else ErrorSteps.at(step, o.errors(kept, system.m))
         resolve(assembled, slice(None), of_gain(), self.form)
         return state, SampledBlock(
             regression, assembled.offset, assembled.gain, z, errors, self.form.units.states

@@ -54,10 +54,10 @@ class Split:
     def coordinates(self, states: tuple[str, ...], units: Array) -> tuple[str, ...]:
         """Names of w's coordinates z, (k,), from those of the states and their units (n,)."""
         if self.basis.shape[1] > self.rank:
-            return states
+            return tuple(f"w_{state}" for state in states)
         own = self.projector[0] * units / units[:, None]
         names = initial_basis(own, self.rank, states, units)[2]
-        return tuple(name.removeprefix("e0_") for name in names)
+        return tuple(name.replace("e0_", "w_", 1) for name in names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +167,7 @@ def fits(
     """
     if outside > _TURNED * size:
         return False
-    return 1.0 / max(inverse, TINY) > math.sqrt(max(rank, 1)) * rank_tol * inner
+    return 1.0 / max(inverse, TINY) > math.sqrt(rank) * rank_tol * inner
 
 
 def within_frame(frame: Frame, pinv: Array) -> Split:

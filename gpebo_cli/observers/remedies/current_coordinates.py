@@ -13,21 +13,21 @@ coordinates, V = I, and Q w = 0 is measured, too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import repeat
 from math import prod
 from typing import TypeAlias
 
 import numpy as np
 
+from gpebo_cli.kernels import arrays
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
-from gpebo_cli.observers.reduced.extension import Extension, joined
+from gpebo_cli.observers.reduced.extension import Extension, joined, kept_of
 from gpebo_cli.observers.reduced.matrices import weakest
-from gpebo_cli.observers.reduced.regression import Assembled, regression_signals
+from gpebo_cli.observers.reduced.regression import Assembled, largest_at, regression_signals
 from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
@@ -81,9 +81,7 @@ class CurrentCoordinates:
             t, inside = times.reshape(2, -1)
             o = reduced.matrices(t, inside)
             signals = reduced.measured(t, inside)
-            rows = np.empty((len(t), k, p + 1))
-            rows[..., :q], rows[..., q:p] = o.from_unknowns, o.dynamics
-            rows[..., p] = (o.from_signals @ signals)[:, :, 0]
+            rows = arrays.joined(o.from_unknowns, o.dynamics, o.from_signals @ signals, axis=2)
             z = np.broadcast_to(identity, (len(t), *identity.shape))
             a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
@@ -104,38 +102,27 @@ class CurrentCoordinates:
             Those elements of windows before in which something was largest stand in front.
             """
             nonlocal past
-            asked, mesh = reduced.signals.asked, reduced.mesh
-            shares: Iterable[Array] = repeat(mesh.edges) if asked is None else mesh.shares(asked)
-            for window, own in zip(mesh.windows(), shares, strict=False):
+            for window in reduced.mesh.windows():
                 mesh, (times, a, rows, smallest, seen), error = resolve(
                     evaluate, window, tol=solver.tol, max_elements=solver.max_elements,
                     name=f"observer of plant {system.name}",
                 )
                 front = past[0].size
-                part = Extension(
+                past = times[:, largest_at(v for v, _ in seen)]
+                yield Extension(
                     mesh.trajectory(rows[front:]), error, a.after(front),
                     np.broadcast_to(a.column_scale, (mesh.size, p)), reduced.units, smallest,
                 )
-                past = times[:, np.unique(np.concatenate([
-                    np.abs(v).max(axis=1).argmax(axis=0) for v, _ in seen
-                ]))]
-                yield part if asked is None else replace(
-                    part.kept_at(own), trajectory=part.trajectory
-                )
 
-        found = joined(parts())
-        mesh, final = found.mesh, found.assembled
-        kept = final.kept_rows(system, reduced.regression)
+        found = joined(kept_of(parts(), reduced.mesh, reduced.signals.asked))
+        kept = found.assembled.kept_rows(system, reduced.regression)
         if rotates:
-            kept = np.union1d(kept, np.arange(final.Y.shape[1] - n, final.Y.shape[1]))
-        some = slice(None) if len(kept) == final.Y.shape[1] else kept  # a slice copies nothing
+            rows = found.assembled.Y.shape[1]
+            kept = np.union1d(kept, np.arange(rows - n, rows))
         return Observation(
             regression=LinearRegression(
-                Y=mesh.trajectory(final.Y[:, some]),
-                psi=mesh.trajectory(final.psi[:, some]),
-                parameters=(*system.unknowns, *(f"w_{label}" for label in reduced.labels)),
-                scale=found.scale,
-                dynamics=Dynamics(found.trajectory, units),
+                *found.rows(kept), parameters=(*system.unknowns, *reduced.labels),
+                scale=found.scale, dynamics=Dynamics(found.trajectory, units),
             ),
             state_map=AffineStateMap(*found.state_map, reduced.form.units.states),
             truth=CurrentState(reduced),

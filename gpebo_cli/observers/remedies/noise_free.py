@@ -65,8 +65,7 @@ class NoiseFree:
 def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observation:
     """The observer along the solution that the estimates η̂ (p,) give."""
     system, state_map = reduced.system, found.state_map
-    if not isinstance(state_map, AffineStateMap):
-        raise TypeError("the observer without a remedy has an affine state map")
+    assert isinstance(state_map, AffineStateMap)  # noqa: S101  as it is without a remedy
     x = state_map.offset.values + state_map.gain.values @ eta
     copy = Linearised(system, Trajectory(state_map.offset.mesh, x), eta[: system.q])
     along = reduced_system(

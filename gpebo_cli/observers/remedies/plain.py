@@ -39,12 +39,9 @@ def observation(
 
     ``growth`` is the largest entry of Φ, and ``logarithm`` that of ‖Φ‖ over the horizon, ().
     """
-    mesh, final = extension.mesh, extension.assembled
-    kept = final.kept_rows(reduced.system, reduced.regression)
-    some = slice(None) if len(kept) == final.Y.shape[1] else kept  # a slice copies nothing
-    start, stop = reduced.signals.span
+    system, noise, (start, stop) = reduced.system, reduced.signals.noise, reduced.signals.span
+    kept = extension.assembled.kept_rows(system, reduced.regression)
     # Along noisy signals the matrices change, too, and Y is not affine in the noise.
-    system, noise = reduced.system, reduced.signals.noise
     noisy = np.arange(system.m + system.r) >= system.m  # of a recording, unless levels are said
     if noise is not None and noise.variances.any():
         noisy = noise.variances > 0.0
@@ -53,9 +50,8 @@ def observation(
     )
     return Observation(
         regression=LinearRegression(
-            Y=mesh.trajectory(final.Y[:, some]), psi=mesh.trajectory(final.psi[:, some]),
-            parameters=reduced.parameters,
-            scale=extension.scale, resets=resets, units=reduced.parameter_units,
+            *extension.rows(kept), parameters=reduced.parameters, scale=extension.scale,
+            resets=resets, units=reduced.parameter_units,
         ),
         state_map=AffineStateMap(*extension.state_map, reduced.form.units.states),
         truth=truth,
@@ -65,7 +61,7 @@ def observation(
         growth_rate=logarithm / (stop - start),
         errors=errors,
         respond=None if errors is None or resets else (
-            lambda e_u, e_y: respond(mesh, errors, len(kept), e_u, e_y)
+            lambda e_u, e_y: respond(extension.mesh, errors, len(kept), e_u, e_y)
         ),
         note=reduced.note if reduced.lost is None else "",  # a warning says it
     )

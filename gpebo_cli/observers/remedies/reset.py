@@ -61,7 +61,7 @@ class Resets:
     def observe(self, reduced: ReducedSystem) -> Observation:
         """One regression over all segments, with the maps from each to the next."""
         mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
-        cuts = [0, *(int(k) for k in np.searchsorted(mesh.edges, times)), mesh.size]
+        cuts = [0, *np.searchsorted(mesh.edges, times).tolist(), mesh.size]
         p = len(reduced.parameters)
         begin, xi_a, dual = reduced.begin, reduced.xi_a, reduced.first.split.dual
         later: list[tuple[float, Array, Array]] = []
@@ -132,8 +132,7 @@ def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
             f"observer.reset_times: {outside[0]:g} is not between start and end, {start:g} and "
             f"{stop:g}"
         )
-    times = list(settings.times)
-    interval = settings.interval
+    times, interval = list(settings.times), settings.interval
     if interval is not None:
         count = (stop - start) / interval
         if count > _MOST:
@@ -141,7 +140,7 @@ def reset_times(reduced: ReducedSystem, settings: Resets) -> Array:
                 f"observer.reset_interval = {interval:g} makes {count:.0f} resets; at most {_MOST}"
             )
         times += [start + k * interval for k in range(1, int(np.ceil(count * (1 - 1e-12))))]
-    if interval is None and not times:
+    elif not times:
         return growth_times(reduced)
     return np.unique(times)
 
@@ -186,5 +185,4 @@ def _with_edges(mesh: Mesh, times: Array) -> tuple[Mesh, Array]:
     near = 1e-9 * float(mesh.edges[-1] - mesh.edges[0])
     finer = Mesh(with_others(mesh.edges, times, near), mesh.rule)
     k = np.unique([int(np.abs(finer.edges - t).argmin()) for t in times])
-    k = k[(k > 0) & (k < finer.size)].astype(np.intp)
-    return finer, finer.edges[k]
+    return finer, finer.edges[k[(k > 0) & (k < finer.size)]]
