@@ -252,34 +252,28 @@ class MixedEstimates(Lasting):
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         g, c = len(self.gains), self.groups[0].quotient.shape[-1] // len(self.start)
-        usual = np.repeat(self.start, c)
         first, last, _ = cases.indices(g * len(self.groups))
+        usual = self.start[None].repeat(c, axis=1)
+        starts = usual.repeat(last - first, axis=0) if start is None else start.repeat(c, axis=1)
         pieces: list[Array] = []
-        done = 0
         for group in range(first // g, (max(last, 1) - 1) // g + 1):
-            path = self.groups[group]
+            path, before = self.groups[group], self.before[group]
             gains = self.gains[max(first - group * g, 0) : min(last - group * g, g)]
             if gains.shape[1] > 1:  # one for each parameter, and for each of its realisations
                 gains = np.repeat(gains, c, axis=1)
-            own = usual
-            if start is not None:
-                own = np.repeat(start[done : done + len(gains)], c, axis=1)
-            done += len(gains)
+            own, starts = starts[: len(gains)], starts[len(gains) :]
             if self.mu is None:
                 pieces.append(self.law(path, own, gains))
                 continue
             # The law goes on from what it had, and not from what was made of it.
-            before, first_one = self.before[group], usual if self.before[group] else own
-            w_c = self._of_start(gains * before) if before else 0.0
+            first_one = usual if before else own
+            w_c = np.minimum(np.exp(-gains * before), 1.0 - self.mu)
             eta = self.law(path, own + w_c * (first_one - own), gains)
-            w_c = self._of_start(gains[:, None] * (before + path.energy_at_t[:, None]))
-            pieces.append((eta - w_c * np.atleast_2d(first_one)[:, None]) / (1.0 - w_c))
+            energy = gains[:, None] * (before + path.energy_at_t[:, None])
+            w_c = np.minimum(np.exp(-energy), 1.0 - self.mu)
+            pieces.append((eta - w_c * first_one[:, None]) / (1.0 - w_c))
         estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
         return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)
-
-    def _of_start(self, energy: Array) -> Array:
-        """w_c after γ∫Δ² (…)."""
-        return np.asarray(np.minimum(np.exp(-energy), 1.0 - (self.mu or 0.0)))
 
 
 def mixed_estimates(

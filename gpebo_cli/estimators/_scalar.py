@@ -18,7 +18,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, reciprocals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
@@ -377,7 +377,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
-    digits = np.divide(1.0, condition, out=np.zeros(len(condition)), where=usable)
+    digits = reciprocals(condition, usable)
     return scalar_path(
         extended.mesh, signals, delta.reshape(points), digits.reshape(points),
         filled(quotient.reshape(*points, -1), usable), t, floor,

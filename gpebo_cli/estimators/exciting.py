@@ -30,6 +30,7 @@ from gpebo_cli.estimators._scalar import ScalarPath, filled, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.linalg import reciprocals
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -157,7 +158,7 @@ class Rotation:
         self._turned = turned[-1]
         known = new > _KNOWN
         e_2 = (turned * np.exp(1j * phi[1:, None])).imag
-        inverse = np.divide(1.0, new, out=np.zeros_like(new), where=known)
+        inverse = reciprocals(new, known)
 
         def errors() -> tuple[list[Filter], list[Array]]:
             (own,), (Q,) = mixed.behind()

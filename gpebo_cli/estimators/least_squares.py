@@ -23,7 +23,7 @@ from gpebo_cli.estimators._information import (
 from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import reciprocals, transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found, Lasting, SampledEstimates, Unmixed
@@ -183,7 +183,7 @@ def solved(extended: Array, units: Array) -> Found:
     size = np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
     eigenvalues, V = np.linalg.eigh(extended[..., :-1] / size / transpose(size))
     told = eigenvalues > _DIGITS * eigenvalues[..., -1:]
-    share = np.where(told, 1.0 / np.where(told, eigenvalues, 1.0), 0.0)[..., None]
+    share = reciprocals(eigenvalues, told)[..., None]
     eta = V @ (share * (transpose(V) @ (extended[..., -1:] / size))) / size
     final = np.linalg.svd(extended[:, -1, :, :-1] * units * units[:, None], compute_uv=False)
     worst = float((final[:, -1] / final[:, 0]).min())

@@ -22,7 +22,7 @@ from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import among
-from gpebo_cli.numerics.linalg import transpose, triangular
+from gpebo_cli.numerics.linalg import reciprocals, transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Sampler
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
@@ -291,10 +291,9 @@ def of_least_squares(
     numbers mean nothing. The regression has no resets, ``known`` is of G with the end last, and the
     ``gain`` is that of the state at the end (n, p); the others are as of :func:`deviations`.
     """
-    mesh, V = regression.mesh, known.vectors[-1]
+    mesh, V, sizes = regression.mesh, known.vectors[-1], known.sizes[-1]
     seen = known.eigenvalues[-1] >= known.level[-1].max(initial=0.0)
-    inverse = np.where(seen, 1.0 / np.where(seen, known.eigenvalues[-1], 1.0), 0.0)
-    inverse = (V * inverse) @ V.T / known.sizes[-1] / known.sizes[-1][:, None]
+    inverse = (V * reciprocals(known.eigenvalues[-1], seen)) @ V.T / sizes / sizes[:, None]
     of_eta, of_x = deviations(
         observer, _sums(regression, inverse), gain[None], mesh.edges, rows, variances,
         mesh.edges[-1:],
@@ -348,7 +347,7 @@ def noise_level(
         )
     _, sigma, Vt = np.linalg.svd(root[:, :p], full_matrices=False)
     known = sigma > np.sqrt(_SINGULAR) * sigma.max(initial=0.0)
-    inverse = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[:, None] * Vt
+    inverse = reciprocals(sigma, known)[:, None] * Vt
 
     def of_Y(t: Array, inside: Array) -> ErrorSystem:
         o = observer(t, inside)
@@ -687,7 +686,7 @@ class SampledDeviations:
         self._expected, self._square = float(expected[-1]), float(of_Y[-1])
         _, sigma, Vt = np.linalg.svd(roots[:, :-1, :-1])
         known = sigma**2 > _SINGULAR * sigma[:, :1] ** 2
-        fitted = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[..., None] * (Vt @ of_h)
+        fitted = reciprocals(sigma, known)[..., None] * (Vt @ of_h)
         left = expected - (fitted**2).sum(axis=(1, 2))
         left[left <= _LEFT * expected] = np.nan
         return np.asarray(np.abs(roots[:, -1, -1]) / np.sqrt(left))
