@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates, finite_time
+from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
@@ -86,11 +86,7 @@ class FiniteTime(ResumableEstimator):
 
         After a reset the law starts anew from the corrected estimate.
         """
-        condition, needed, needed_for = finite_time(float(self.mu))
-        return replace(
-            self.inner.resume(regression, t, known), mu=float(self.mu), condition=condition,
-            needed=needed, needed_for=needed_for,
-        )
+        return replace(self.inner.resume(regression, t, known), mu=float(self.mu))
 
 
 ESTIMATOR = FiniteTime

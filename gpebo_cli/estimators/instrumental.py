@@ -48,7 +48,7 @@ def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) 
 
 
 def averaged(
-    regression: LinearRegression, delay: float, settle: float, before: Array | float = 0.0
+    regression: LinearRegression, delay: float, settle: float, before: Array | float
 ) -> Trajectory:
     """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
 
@@ -106,7 +106,7 @@ class Instrumental(WindowedEstimator):
         square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
         path = mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor)
         return mixed_estimates(
-            self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known=known
+            self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known
         )
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:

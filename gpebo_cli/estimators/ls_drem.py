@@ -125,7 +125,7 @@ class LsDrem(ResumableEstimator):
             for info, case in zip(infos, part.cases, strict=True)
         )
         return mixed_estimates(
-            self, regression, groups, lambda: tuple(info.reached for info in infos), "IE", known
+            self, regression, groups, lambda: tuple(info.reached for info in infos), known, "IE"
         )
 
 

@@ -159,11 +159,8 @@ class MonotoneEstimates:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        return _requirement(self.gains, float(self.path.energy_at_t[-1]), self.mu)
-
-
-def _requirement(gains: Array, energy: float, mu: float) -> Requirement:
-    return energy_requirement("Δ not in L2", float(gains.min()), energy, DECAY / mu)
+        energy = float(self.path.energy_at_t[-1])
+        return energy_requirement("Δ not in L2", self.gains, energy, DECAY / self.mu)
 
 
 class RecursiveMonotone:
@@ -232,7 +229,7 @@ class RecursiveMonotone:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² so far."""
-        return _requirement(self._gains, self._energy, self._mu)
+        return energy_requirement("Δ not in L2", self._gains, self._energy, DECAY / self._mu)
 
 
 ESTIMATOR = Monotone

@@ -166,9 +166,8 @@ class _Chain:
         zero. Elements may be ``cuts`` from times of the first kind to those of the second.
         """
         self._observer = self.observer = observer  # asked once where it is alike at all times
-        self._behind, self._groups, self._anew, self._turns = (
-            (estimator, n), groups, anew.tolist(), turns
-        )
+        self._estimator, self._n, self._groups = estimator, n, groups
+        self._anew, self._turns = anew.tolist(), turns
         # The errors that count from the start of each group on.
         beside = groups.first[:, None] + np.arange(1 + groups.memory.shape[1])
         beside = beside.clip(max=len(groups.shares) - 1)
@@ -181,7 +180,7 @@ class _Chain:
 
     def looked(self, mesh: Mesh, t: Array) -> tuple[Mesh, ErrorSystem]:
         """The next elements with layers where times t (M,) are, and their joint system."""
-        joint, o = _joint(self._observer, *self._behind, mesh, slice(None))
+        joint, o = self._joint(self._observer, mesh)
         if self._group < 0:
             self.unknown = bool(np.isnan(joint.C[0]).any())
         self.zeta, alike = o.A.shape[1], all(len(part) == 1 for part in o)
@@ -191,7 +190,7 @@ class _Chain:
         layered = _layered(mesh, self._groups.starts, self.rate, t)
         if layered.size == mesh.size:
             return mesh, joint
-        return layered, _joint(self.observer, *self._behind, layered, slice(None))[0]
+        return layered, self._joint(self.observer, layered)[0]
 
     def along(
         self, mesh: Mesh, joint: ErrorSystem, t: Array
@@ -230,7 +229,29 @@ class _Chain:
                 return mesh, maps, factors, (common, varies)
             mesh, kept = mesh.split(wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages))
             maps, varies, new, cuts = maps[kept], varies[kept], kept < 0, cuts + 1
-            joint = _joint(self.observer, *self._behind, mesh, new)[0]
+            joint = self._joint(self.observer, mesh, new)[0]
+
+    def _joint(
+        self, observer: ErrorsAt, mesh: Mesh, part: BoolArray | slice = slice(None)
+    ) -> tuple[ErrorSystem, ErrorSystem]:
+        """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at nodes of some elements, and C of s.
+
+        Beside it stands the system of ζ at all of these nodes.
+        """
+        points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
+        o, e = observer(points, inside), self._estimator(points, inside)
+        zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
+        rows = o.C.shape[1] - self._n
+        A = np.zeros((len(points), zeta + own, zeta + own))
+        A[:, :zeta, :zeta] = o.A
+        A[:, zeta:, :zeta] = e.B @ o.C[:, :rows]
+        A[:, zeta:, zeta:] = e.A
+        B = np.zeros((len(points), zeta + own, signals))
+        B[:, :zeta] = o.B
+        B[:, zeta:] = e.B @ o.D[:, :rows]
+        shape = (-1, mesh.rule.stages, zeta + own)
+        system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
+        return system, o
 
     def _turned(self, left: Array, maps: Array) -> dict[int, Array]:
         """What makes [ζ; s] of itself (d, d) at the ``left`` ends of some elements, by number."""
@@ -520,29 +541,6 @@ def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) 
         out[step] = end[:, :k] @ out[step]
         out[step, :, k:] += end[:, k:]
     return out
-
-
-def _joint(
-    observer: ErrorsAt, estimator: ErrorsAt, n: int, mesh: Mesh, part: BoolArray | slice
-) -> tuple[ErrorSystem, ErrorSystem]:
-    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at nodes of some elements, and C of s.
-
-    Beside it stands the system of ζ at all of these nodes.
-    """
-    points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
-    o, e = observer(points, inside), estimator(points, inside)
-    zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
-    rows = o.C.shape[1] - n
-    A = np.zeros((len(points), zeta + own, zeta + own))
-    A[:, :zeta, :zeta] = o.A
-    A[:, zeta:, :zeta] = e.B @ o.C[:, :rows]
-    A[:, zeta:, zeta:] = e.A
-    B = np.zeros((len(points), zeta + own, signals))
-    B[:, :zeta] = o.B
-    B[:, zeta:] = e.B @ o.D[:, :rows]
-    shape = (-1, mesh.rule.stages, zeta + own)
-    system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
-    return system, o
 
 
 def _factors(
