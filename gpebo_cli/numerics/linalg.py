@@ -93,7 +93,7 @@ def products_of_others(factors: Array) -> Array:
     ones = np.ones((*factors.shape[:-1], 1))
     before = np.concatenate([ones, np.cumprod(factors[..., :-1], axis=-1)], axis=-1)
     after = np.concatenate([np.cumprod(factors[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
-    return before * after
+    return np.asarray(before * after)
 
 
 def determinant_and_adjugate_action(
