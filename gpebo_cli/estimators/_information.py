@@ -240,7 +240,7 @@ class Spectrum:
 
     def delta(self, alpha: float, f0: float) -> Array:
         """Δ = det H (M,)."""
-        return np.prod(self.eigenvalues * self.share(alpha, f0), axis=1)
+        return np.asarray(np.prod(self.eigenvalues * self.share(alpha, f0), axis=1))
 
     def adjugate(self, alpha: float, f0: float) -> Array:
         """Of adj(H) αF in the eigenbasis of G_z the diagonal (M, p)."""

@@ -138,9 +138,9 @@ def scalar_law(
     From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1). In
     ``units`` (p,) parameters are comparable.
     """
+    start = np.broadcast_to(start, (len(gains), start.shape[-1]))
     if not (path.digits > SINGULAR).any():  # nothing is known, and η̂ does not move
-        wide = np.broadcast_to(start, (len(gains), start.shape[-1]))
-        return wide[:, None].repeat(len(path.t), axis=1)
+        return start[:, None].repeat(len(path.t), axis=1)
     seen, own = path.comparable(units), start / units
     variation, size = _variation(seen, float(gains.max(initial=0.0)), own)
     if variation <= _CONSTANT * size and not _drifts(seen, float(gains.max()), size):
@@ -150,10 +150,9 @@ def scalar_law(
     elements = min(path.mesh.size, _STRETCH)
     lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
-    starts = np.broadcast_to(own, (len(gains), start.shape[-1]))
     try:
         return units * np.concatenate([
-            _integrate(seen, starts[i : i + batch], gains[i : i + batch])
+            _integrate(seen, own[i : i + batch], gains[i : i + batch])
             for i in range(0, len(gains), batch)
         ])
     except _UnresolvedError:
@@ -199,7 +198,7 @@ def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     zero, count = np.zeros_like(final), len(path.t)
     return kernels.laws.stepped_law(
         whole, final, zero, zero, np.zeros(count, dtype=np.intp), path.energy_at_t,
-        np.zeros(count), np.atleast_2d(start), gains,
+        np.zeros(count), start, gains,
     )
 
 
@@ -225,7 +224,7 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     share = np.divide(partial, step, out=np.zeros_like(partial), where=partial > 0)
     return kernels.laws.stepped_law(
         length.ravel(), quotient[:, :-1].reshape(-1, p), np.diff(quotient, axis=1).reshape(-1, p),
-        jump.reshape(-1, p), element * s + index, partial, share, np.atleast_2d(start), gains,
+        jump.reshape(-1, p), element * s + index, partial, share, start, gains,
     )
 
 

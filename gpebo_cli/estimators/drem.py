@@ -28,29 +28,41 @@ class Drem(FilteredEstimator):
     def estimate_moving(
         self, regression: LinearRegression, t: Array, known: Known, dynamics: Dynamics
     ) -> VectorEstimates:
-        """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) with 𝐘 = adj(Ω)𝒴, at the times t (M,).
+        """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) at the times t (M,).
 
-        γ∫Δ² has to be larger than the growth of η, so that the error falls.
+        It follows where γΔ² exceeds the growth of η.
         """
         names = regression.parameters
-        rates, gains = filter_rates(self.rates, names), self.gains("gamma", names)
+        rates = filter_rates(self.rates, names)
         extended = filtered(regression.outer, rates, rates, dynamics, known)
-        mesh, values = extended.mesh, extended.values
-        delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
-        same = Trajectory(mesh, np.broadcast_to(delta[..., None, None], Y.shape))
-        law = VectorLaw(None, same, Trajectory(mesh, Y[..., 0]), dynamics=dynamics, mixed=True)
-        energy = sum(each.energy for each in known)
-        energy += float(Trajectory(mesh, delta**2).integral().final)
-        growth = dynamics.growth
-        requirement = energy_requirement(
-            "γ∫Δ² above the growth of the state", gains, energy, growth + DECAY,
-            f"1 % of the initial error of a state that may grow by e^{growth:.3g}",
+        return follow(
+            extended, dynamics, self.start(names), self.gains("gamma", names), np.asarray(t), known
         )
-        state = replace(state_of(extended, known), energy=energy)
-        return VectorEstimates(
-            law, self.start(names), gains, np.asarray(t), same, requirement, reached=(state,),
-            mixed=Trajectory(mesh, delta),
-        )
+
+
+def follow(
+    extended: Trajectory, dynamics: Dynamics, start: Array, gains: Array, t: Array,
+    known: Known = (),
+) -> VectorEstimates:
+    """η̂' = 𝔸η̂ + 𝕓 + ΓΔ (𝐘 − Δ η̂) with Δ and 𝐘 = adj(Ω)𝒴 of [Ω | 𝒴] (p, p + 1), on its mesh.
+
+    γ∫Δ² has to be larger than the growth of η, so that the error falls.
+    """
+    values = extended.values
+    delta, Y, _ = determinant_and_adjugate_action(values[..., :-1], values[..., -1:])
+    mesh = extended.mesh
+    same = Trajectory(mesh, np.broadcast_to(delta[..., None, None], Y.shape))
+    law = VectorLaw(None, same, Trajectory(mesh, Y[..., 0]), dynamics=dynamics, mixed=True)
+    mixed = Trajectory(mesh, delta)
+    energy = sum(each.energy for each in known) + float(Trajectory(mesh, delta**2).integral().final)
+    requirement = energy_requirement(
+        "γ∫Δ² above the growth of the state", gains, energy, dynamics.growth + DECAY,
+        f"1 % of the initial error of a state that may grow by e^{dynamics.growth:.3g}",
+    )
+    state = replace(state_of(extended, known), energy=energy)
+    return VectorEstimates(
+        law, start, gains, t, same, requirement, reached=(state,), mixed=mixed
+    )
 
 
 ESTIMATOR = Drem

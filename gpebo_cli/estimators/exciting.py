@@ -80,19 +80,14 @@ class Exciting(WindowedEstimator):
             path.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
         ).trajectory
 
-        def digits(delta: Array) -> Array:
-            return np.minimum(np.abs(delta), 1.0)
-
         def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             values = found(t, inside)[:, 1]
-            return values[:, 0], values[:, 1:], digits(values[:, 0])
+            return values[:, 0], values[:, 1:], np.abs(values[:, 0])
 
         new, right = found.values[:, :, 1, 0], found.values[:, :, 1, 1:]
         usable = np.abs(new) > _KNOWN
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
-        law = scalar_path(
-            found.mesh, signals, new, digits(new), quotient, np.asarray(t), path.floor
-        )
+        law = scalar_path(found.mesh, signals, new, np.abs(new), quotient, t, path.floor)
         (end,) = inner.at_end()
         end = replace(end, turned=found.final)
         return replace(inner, groups=(law,), condition="IE", at_end=lambda: (end,))

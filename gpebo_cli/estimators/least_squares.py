@@ -135,8 +135,7 @@ class LeastSquares(ResumableEstimator):
                 "accepted: estimator.bound=null"
             )
         p = regression.p
-        start = self.start(regression.parameters)
-        prior = np.column_stack([np.eye(p), start])
+        prior = np.column_stack([np.eye(p), self.start(regression.parameters)])
         ones, begin = np.ones(p), (regression.whole or regression).mesh.edges[0]
         reached = list[ExtensionState]()
 
@@ -150,8 +149,7 @@ class LeastSquares(ResumableEstimator):
             gram = found(t)
             if "f0" not in case:
                 energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
-                elapsed = t - begin
-                units = prior_units(energy, regression.terms(t), elapsed, rounding)
+                units = prior_units(energy, regression.terms(t), t - begin, rounding)
                 gram += units[..., None] ** 2 * prior
             return gram
 
@@ -275,26 +273,24 @@ class RecursiveLeastSquares:
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        spectra, _ = self.spectra(regression)
+        pairs = list(zip(self._cases, self.spectra(regression)[0], strict=True))
         ratios = np.min([
             case["alpha"] * s.eigenvalues.min(axis=1, initial=np.inf) / (f0_of(case) * s.memory)
-            for case, s in zip(self._cases, spectra, strict=True)
+            for case, s in pairs
         ], axis=0)
         self._ratio = float(ratios[-1])
-        solved = [
-            s.solution(case["alpha"], f0_of(case), self._start)
-            for case, s in zip(self._cases, spectra, strict=True)
-        ]
+        eta = np.array([s.solution(case["alpha"], f0_of(case), self._start) for case, s in pairs])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂ = αF δh_z."""
-            filters = [integrating(regression, case["beta"]) for case in self._cases]
             return tuple(
-                ErrorRecursion(*own, s.covariance(case["alpha"], f0_of(case)))
-                for own, case, s in zip(filters, self._cases, spectra, strict=True)
+                ErrorRecursion(
+                    *integrating(regression, case["beta"]), s.covariance(case["alpha"], f0_of(case))
+                )
+                for case, s in pairs
             )
 
-        return SampledEstimates(np.array(solved)[..., 0], None, errors, ratios >= _NEEDED)
+        return SampledEstimates(eta[..., 0], None, errors, ratios >= _NEEDED)
 
     @property
     def requirement(self) -> Requirement:

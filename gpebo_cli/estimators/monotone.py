@@ -181,8 +181,7 @@ class RecursiveMonotone:
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each; nobody knows how errors go through."""
         if self._theta is None:
-            S, T, self._mu, start = self._settings.law(regression.parametrisation)
-            self._S, self._T = S, T
+            self._S, self._T, self._mu, start = self._settings.law(regression.parametrisation)
             self._theta = np.tile(start, (len(self._gains), 1))
         mixed = self._mixing(regression)
         energy, goal, _ = self._steps.means(regression, mixed.delta**2, mixed)
