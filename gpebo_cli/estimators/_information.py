@@ -278,11 +278,11 @@ def information(
     With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and the size of
     f₀ do not matter.
     """
-    level, before = level_of(regression.gram.final), 1.0
-    began = float(regression.mesh.edges[0])
-    if known is not None:
-        level, before = np.maximum(level, known.level), known.memory
-        began = known.began
+    final = regression.gram.final
+    if known is None:
+        began = float(regression.mesh.edges[0])
+        known = ExtensionState(np.zeros_like(final), 0.0, began=began)
+    level, began = np.maximum(level_of(final), known.level), known.began
 
     def units(t: Array, energy: Array, rounding: Array) -> Array:
         return prior_units(energy, regression.terms(t), t - began, rounding)
@@ -292,24 +292,24 @@ def information(
 
     if beta == 0.0:
         gram = regression.gram
-        if known is not None:
+        if known.values.any():  # else it is the regression's own, which is held anyway
             gram = Trajectory(gram.mesh, gram.values + known.values)
-        memory = np.full(regression.mesh.points.shape, before)
+        memory = np.full(regression.mesh.points.shape, known.memory)
         return made(gram, Trajectory(regression.mesh, memory))
     if bound is None:
-        start = None if known is None else beta * known.values
         # β ∫ e^{−β(t−s)} (·) ds
-        filtered = low_pass(regression.outer, np.array(beta), start)
+        filtered = low_pass(regression.outer, np.array(beta), beta * known.values)
         mesh = filtered.mesh
+        memory = known.memory * np.exp(-beta * (mesh.points - mesh.edges[0]))
         # Never 0, beside which what is not excited has a share of 0/0.
-        memory = np.maximum(before * np.exp(-beta * (mesh.points - mesh.edges[0])), _FORGOTTEN)
+        memory = np.maximum(memory, _FORGOTTEN)
         return made(Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory))
     return made(*_bounded(regression, alpha, f0 or 0.0, beta, bound, known))
 
 
 def _bounded(
     regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float,
-    known: ExtensionState | None,
+    known: ExtensionState,
 ) -> tuple[Trajectory, Trajectory]:
     """[G_z | h_z] and z with forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
 
@@ -331,10 +331,7 @@ def _bounded(
         outer = mesh.along(outer)
     R, p = mesh.rule.integration, regression.p
     gram, memory = np.empty_like(outer.values), np.empty(outer.values.shape[:2])
-    G, z = np.zeros(outer.values.shape[2:]), 1.0
-    if known is not None:
-        G, z = known.values, known.memory
-    eye = f0 * np.eye(p)
+    G, z, eye = known.values, known.memory, f0 * np.eye(p)
     for k, h in enumerate(mesh.steps):
         gram[k, 0], memory[k, 0] = G, z
         added = outer.values[k, 1:]
