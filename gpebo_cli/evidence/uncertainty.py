@@ -71,17 +71,18 @@ def deviations(
     where errors move s so fast that rounding decides how slow the rest of it is.
     """
     most = 1 if resets else len(rows.t) // _GROUPS
-    per, before = _PER_ELAPSED, list[Array]()
+    per, p = _PER_ELAPSED, gain.shape[2]
+    before: Array | None = None
     anew = edges[:1] if starts is None else starts
     while True:
         groups = grouped(rows, edges[-1], t, anew, most, per)
         found = _propagated(
             observer, estimator, gain, edges, groups, variances, t, anew, resets
         )
-        if groups.alone or (before and all(map(_agree, before, found))):
-            return found[0], found[1]
-        finer = 4 if before else 2
-        before, most, per = [*found], most // finer, per * finer
+        if groups.alone or (before is not None and _agree(before, found)):
+            return found[:, :p], found[:, p:]
+        finer = 2 if before is None else 4
+        before, most, per = found, most // finer, per * finer
 
 
 def _agree(coarse: Array, fine: Array) -> bool:
@@ -93,8 +94,8 @@ def _agree(coarse: Array, fine: Array) -> bool:
 def _propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
     variances: Array, t: Array, starts: Array, resets: Sequence[tuple[float, Array]],
-) -> tuple[Array, Array]:
-    """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
+) -> Array:
+    """:func:`deviations` of grouped rows, side by side (M, p + n); the gain is (M, n, p)."""
     n, p = gain.shape[1:]
     begun = np.union1d(starts, [time for time, _ in resets])
     mesh = _mesh(edges, groups, begun)
@@ -102,7 +103,7 @@ def _propagated(
     turns = {float(mesh.edges[np.searchsorted(mesh.edges, time)]): turn for time, turn in resets}
     cut_until = mesh.edges[(np.searchsorted(mesh.edges, begun) + _FIRST).clip(max=mesh.size)]
     chain = _Chain(observer, estimator, n, groups, variances, anew, turns, (begun, cut_until))
-    of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
+    found = np.empty((len(t), p + n))
     stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
     cuts = mesh.edges[stretch:-1:stretch]
     all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
@@ -110,7 +111,7 @@ def _propagated(
         part = Mesh(mesh.edges[first : first + stretch + 1], mesh.rule)
         part, joint = chain.looked(part, t[chosen])
         if chain.rate * (edges[-1] - edges[0]) > _FASTEST:
-            return np.full(of_eta.shape, np.nan), np.full(of_x.shape, np.nan)
+            return np.full(found.shape, np.nan)
         part, maps, factors, (common, varies) = chain.along(part, joint, t[chosen])
         if not len(chosen):
             continue
@@ -135,13 +136,11 @@ def _propagated(
         out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
         out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
         out[:, p:, :zeta], out[:, p:, size:] = o.C[:, rows:], o.D[:, rows:]
-        found = _sizes(out @ here @ before)
-        of_eta[chosen], of_x[chosen] = found[:, :p], found[:, p:]
+        found[chosen] = _sizes(out @ here @ before)
     if chain.unknown:  # one row alone says nothing of that, but rounding does
         row = groups.after[0] - groups.starts[0]
-        for each in (of_eta, of_x):
-            each[t < groups.after[0] + _SNAP * row] = np.nan
-    return of_eta, of_x
+        found[t < groups.after[0] + _SNAP * row] = np.nan
+    return found
 
 
 def _sizes(rows: Array) -> Array:
