@@ -40,7 +40,7 @@ _LANES = 1 << 22  # numbers in one batch of gains
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
 # there, because its weight in every law is ∫Δ².
 SINGULAR = 1e-14
-_FILTERED, _CUTS = 1e-11, 30  # tail of what a filter follows, and rounds of cuts for it
+_FILTERED = 1e-11  # tail of what a filter follows
 
 
 def kreisselmeier(
@@ -67,7 +67,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     edges = signal.mesh.edges
     smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
     fastest = float(np.max(rate))
-    for _ in range(_CUTS):
+    while True:
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
         # Where elements are short beside the filter, the signal is what is not resolved.
         poor = (mesh.steps * fastest > 0.5) & (mesh.steps > smallest)
@@ -75,9 +75,8 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
             flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
             poor &= unresolved(flat, mesh.rule) > _FILTERED
         if not poor.any():
-            break
+            return filtered
         signal = mesh.split(np.where(poor, 4, 1))[0].along(signal)
-    return filtered
 
 
 def lion(regression: LinearRegression, rates: Array, start: Array | None = None) -> Trajectory:
@@ -173,9 +172,8 @@ def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, floa
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(quotient[:, 1:] - quotient[:, :-1])
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
-    if much.any():
-        rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
-        change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
+    rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
+    change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
     return float((weight * change).max(initial=0.0)), float(size)
 
 
@@ -218,9 +216,6 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     index = np.clip(np.searchsorted(path.mesh.rule.points, local, side="right") - 1, 0, s - 1)
     step = length[element, index]
     partial = np.clip(path.energy_at_t - energy[element, index], 0.0, step)
-    # At the next point itself the step has no length.
-    there = (partial == step) & (index < s - 1)
-    index, partial = index + there, np.where(there, 0.0, partial)
     share = np.divide(partial, step, out=np.zeros_like(partial), where=partial > 0)
     return kernels.laws.stepped_law(
         length.ravel(), quotient[:, :-1].reshape(-1, p), np.diff(quotient, axis=1).reshape(-1, p),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -69,12 +70,11 @@ class FiniteTime(ResumableEstimator):
             found = errors(t, inside)
             return found._replace(C=found.C / (1.0 - w_c)[..., None])
 
+        errors = self.inner.errors(regression, known)
+        pairs = product(zip(inner.groups, inner.before, strict=True), gains)
         return tuple(
-            partial(
-                at, errors, inner.groups[i // len(gains)], inner.before[i // len(gains)],
-                gains[i % len(gains)],
-            )
-            for i, errors in enumerate(self.inner.errors(regression, known))
+            partial(at, own, *group, gain)
+            for own, (group, gain) in zip(errors, pairs, strict=True)
         )
 
     def recursive(self, parameters: Sequence[str]) -> Recursion:

@@ -262,7 +262,7 @@ def _growth_resolved(
                 f"{rates[worst]:.3g} 1/s near t = {mesh.edges[worst]:.6g}, which takes more than "
                 f"solver.max_elements = {most:.0f} elements; shorten time.horizon"
             )
-    return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
+    return mesh.split(parts.astype(np.intp))[0]
 
 
 def _missed(
