@@ -227,6 +227,7 @@ def test_monotony_is_verified_on_the_whole_box(entries, T, message):
             estimator.estimate(made, np.array([1.0]))
         return
     found = estimator.estimate(made, np.array([1.0]))
+    assert replace(estimator, initial={"a": 1, "b": 2}).law(p)[3].tolist() == [1.0, 2.0]
     theta = np.random.default_rng(0).uniform(p.low, p.high, (1000, 2))
     slope = found.T @ p.jacobian(theta)
     least = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0].min()
