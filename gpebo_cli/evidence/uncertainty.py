@@ -97,13 +97,8 @@ def _propagated(
 ) -> Array:
     """:func:`deviations` of grouped rows, side by side (M, p + n); the gain is (M, n, p)."""
     n, p = gain.shape[1:]
-    begun = np.union1d(starts, [time for time, _ in resets])
-    mesh = _mesh(edges, groups, begun)
-    anew = mesh.edges[np.searchsorted(mesh.edges, starts)]
-    turns = {float(mesh.edges[np.searchsorted(mesh.edges, time)]): turn for time, turn in resets}
-    cut_until = mesh.edges[(np.searchsorted(mesh.edges, begun) + _FIRST).clip(max=mesh.size)]
-    chain = _Chain(observer, estimator, n, groups, variances, anew, turns, (begun, cut_until))
-    found = np.empty((len(t), p + n))
+    chain = _Chain(observer, estimator, n, edges, groups, variances, starts, resets)
+    mesh, found = chain.mesh, np.empty((len(t), p + n))
     stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
     cuts = mesh.edges[stretch:-1:stretch]
     all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
@@ -156,24 +151,26 @@ class _Chain:
     unknown = False  # whether C is NaN at the start
 
     def __init__(
-        self, observer: ErrorsAt, estimator: ErrorsAt, n: int, groups: Groups, variances: Array,
-        anew: Array, turns: Mapping[float, Array], cuts: tuple[Array, Array],
+        self, observer: ErrorsAt, estimator: ErrorsAt, n: int, edges: Array, groups: Groups,
+        variances: Array, starts: Array, resets: Sequence[tuple[float, Array]],
     ) -> None:
-        """Prepare for the first element.
-
-        All errors begin anew at edges ``anew``; at those of ``turns`` s is made of [ζ; s], and ζ is
-        zero. Elements may be ``cuts`` from times of the first kind to those of the second.
-        """
+        """Prepare for the first element, of n states; the others are as of :func:`deviations`."""
         self._observer = self.observer = observer  # asked once where it is alike at all times
         self._estimator, self._n, self._groups = estimator, n, groups
-        self._anew, self._turns = anew.tolist(), turns
+        begun = np.union1d(starts, [time for time, _ in resets])
+        self.mesh = mesh = _mesh(edges, groups, begun)
+        # At some edges all errors begin anew, at others s is made of [ζ; s], and ζ is zero.
+        self._anew = mesh.edges[mesh.edges.searchsorted(starts)].tolist()
+        self._turns = {float(mesh.edges[mesh.edges.searchsorted(at)]): turn for at, turn in resets}
+        # Elements may be cut from times of the first kind to those of the second.
+        until = mesh.edges[(mesh.edges.searchsorted(begun) + _FIRST).clip(max=mesh.size)]
+        self._cuts = begun, until
         # The errors that count from the start of each group on.
         beside = groups.first[:, None] + np.arange(1 + groups.memory.shape[1])
         beside = beside.clip(max=len(groups.shares) - 1)
         self.shares, self._memory = groups.shares[beside], groups.memory[beside]
         self._deviations = self.shares[..., None] * np.sqrt(variances)
         self._until = np.append(groups.starts[1:], np.inf)
-        self._cuts = cuts
         self._L: Array | None = None
         self._group = -1  # the last one
 
@@ -256,7 +253,7 @@ class _Chain:
         """What makes [ζ; s] of itself (d, d) at the ``left`` ends of some elements, by number."""
         zeta, eye = self.zeta, np.eye(maps.shape[2])[self.zeta :]
         eye[:, :zeta] = 0.0
-        edges = dict.fromkeys(self._anew, eye) | dict(self._turns)
+        edges = dict.fromkeys(self._anew, eye) | self._turns
         return {
             k: np.pad(edges[time], ((zeta, 0), (0, 0)))
             for k, time in enumerate(left.tolist()) if time in edges
