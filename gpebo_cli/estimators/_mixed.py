@@ -141,7 +141,7 @@ def energy_requirement(
     condition: str, gains: Array, energy: float, needed: float,
     needed_for: str = _ONE_PERCENT, of: str = "∫Δ²", *, paced: bool = False,
 ) -> Requirement:
-    """Whether ∫Δ² is enough at the smallest of the gains: the error shrinks by e^{−γ∫Δ²}.
+    """Whether ∫Δ² is enough at the smallest gain of (g, 1 or p): the error shrinks by e^{−γ∫Δ²}.
 
     If it is ``paced``, γ is one over the length T of the memory.
     """

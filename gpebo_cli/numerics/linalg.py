@@ -38,7 +38,7 @@ def transpose(a: Array) -> Array:
 
 
 def reciprocals(values: Array, known: BoolArray) -> Array:
-    """1/values (…) where they are ``known``, a mask that broadcasts to them, and 0 elsewhere."""
+    """1/values (…,) where they are ``known``, a mask that broadcasts to them, and 0 elsewhere."""
     return np.divide(1.0, values, out=np.zeros_like(values), where=known)
 
 
