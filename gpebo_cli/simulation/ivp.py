@@ -83,7 +83,7 @@ def consistent_start(
 
 def solve(
     problem: LinearProblem, mesh: Mesh, *, tol: float, max_elements: int,
-    restarts: Mapping[float, Callable[[Array], Array]],
+    restarts: Mapping[float, Callable[[Array], Array]] | None = None,
 ) -> LinearSolution:
     """Same meaning as :func:`gpebo_cli.numerics.collocation.solve`, for E = I (n, n) only.
 
@@ -92,7 +92,7 @@ def solve(
     plain = replace(problem, units=None)
 
     def evaluate(mesh: Mesh, _: object, kept: IntArray) -> tuple[_Found, Array]:  # noqa: ARG001
-        values = _sample(problem, mesh, max(tol, 1e-13), restarts)
+        values = _sample(problem, mesh, max(tol, 1e-13), restarts or {})
         extras = problem.coefficients(mesh.points.ravel(), mesh.inside.ravel()).extras
         extras = tuple(at_points(e, mesh.size, mesh.rule.stages) for e in extras)
         sizes = largest_over_time(values, 2)
@@ -104,7 +104,7 @@ def solve(
         name=f"{problem.name} (solver=ivp)",
     )
     # What a looser tolerance changes tells how far errors of steps have grown.
-    rough = _sample(problem, mesh, max(10.0 * tol, 1e-12), restarts)
+    rough = _sample(problem, mesh, max(10.0 * tol, 1e-12), restarts or {})
     sizes = largest_over_time(values, 2)
     beside = np.maximum(sizes, 1e-9 * sizes.max(initial=1e-100))
     errors = largest_over_time(values - rough, 2) / beside
