@@ -951,7 +951,7 @@ def test_an_estimator_that_is_not_resolved_names_what_would_help(monkeypatch):
 
 
 @pytest.mark.parametrize("units", [None, 1e-3])
-def test_the_covariance_by_elimination_is_that_of_the_spectrum(units):
+def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units):
     """Of G with few digits, or none in a direction, with f₀ or without (units of rounding)."""
     vectors = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     sizes = np.array([[4.0, 2.0, 1.0], [4.0, 2.0, 1e-4], [4.0, 2.0, 1e-14], [4.0, 0.0, 0.0]])
@@ -963,3 +963,5 @@ def test_the_covariance_by_elimination_is_that_of_the_spectrum(units):
     share = np.where(known, 2.0 / (2.0 * sizes + 0.5 * own), 0.0)
     expected = (vectors * share[:, None]) @ vectors.T
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
+    found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
+    np.testing.assert_allclose(found, by_spectrum, atol=1e-8)

@@ -227,6 +227,7 @@ def test_monotony_is_verified_on_the_whole_box(entries, T, message):
             estimator.estimate(made, np.array([1.0]))
         return
     found = estimator.estimate(made, np.array([1.0]))
+    assert replace(estimator, initial={"a": 1, "b": 2}).law(p)[3].tolist() == [1.0, 2.0]
     theta = np.random.default_rng(0).uniform(p.low, p.high, (1000, 2))
     slope = found.T @ p.jacobian(theta)
     least = np.linalg.eigvalsh(slope + np.swapaxes(slope, 1, 2))[:, 0].min()
@@ -269,3 +270,14 @@ def test_the_monotone_gradient_is_for_parametrisations():
         "name": "gaussian", "outputs": 0.01, "sample_time": 0.1})
     assert abs(found.estimates["a"][0, -1] - 2.0) < 0.05
     assert {"a_std", "eta_3_std"} <= set(found.to_pandas("estimates").columns)
+
+
+def test_a_step_too_large_for_newtons_method_is_taken_in_parts():
+    """At samples, from a = 5: a whole step would go where S has no value."""
+    found = run(
+        regression={**TEXT, "S": ["sqrt(a)", "b", "1", "2"], "unknowns": {"a": 0.2, "b": 0.5}},
+        estimator={**MONOTONE, "gamma": 1e14, "initial": {"a": 5, "b": 0.5}},
+        observer={"sample_time": 0.5, "hold": "zoh"}, time={"horizon": 5},
+    )
+    assert found.estimates["a"][0, 0] == pytest.approx(5.0)
+    assert found.estimates["a"][0, -1] == pytest.approx(0.2, abs=1e-9)

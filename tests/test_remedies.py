@@ -155,6 +155,22 @@ def test_the_unknown_is_found_as_well(mapping, remedy, estimator):
     assert theta == pytest.approx(0.7, abs=1e-5 if remedy == "current_coordinates" else 1e-7)
 
 
+def test_a_mixed_signal_is_the_same_up_to_a_reset_and_another_one_from_there_on():
+    early, late = (
+        run(MIXED, 5.0, estimator={"name": "drem"}, remedy="reset", reset_times=[at]).estimation
+        for at in (2.0, 4.0)
+    )
+    same = np.isclose(early.delta[0], late.delta[0], rtol=1e-6, atol=0.0)
+    np.testing.assert_array_equal(same, early.t < 2.0)
+
+
+def test_least_squares_that_follow_stay_at_their_start_until_data_tell():
+    settings = {"name": "least_squares", "f0": None, "initial": 0.3}
+    result = run(MIXED, 5.0, estimator=settings, remedy="current_coordinates")
+    np.testing.assert_allclose(result.estimation.parameters[0, 0], 0.3, rtol=1e-9)
+    assert np.abs(result.estimation.parameters[0, -1, 0] - 0.7) < 1e-4
+
+
 @pytest.mark.parametrize("remedy", ["reset", "current_coordinates"])
 def test_gradient_is_too_slow_for_two_of_them_and_says_so(remedy):
     """With one output the plain gradient cannot pull as fast as errors grow, at any gain."""

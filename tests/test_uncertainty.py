@@ -155,6 +155,8 @@ def fed(system, estimator, t, u, y, hold="linear", noise=None, cut=0):
     ("linear", {"name": "mre"}), ("linear", {"name": "fct", "gamma": 1e8}),
     ("zoh", {"name": "exciting"}), ("linear", {"name": "exciting", "kappa": 1e7}),
     ("linear", {"name": "lion", "gamma": 1e6}),
+    ("zoh", {"name": "instrumental", "gamma": 1e6}),
+    ("linear", {"name": "annihilator", "gamma": 1e6, "perturbed": ["theta1"]}),
 ])
 def test_at_samples_they_are_what_each_error_by_itself_does(hold, estimator):
     t = np.cumsum(np.random.default_rng(1).uniform(0.2, 0.6, 10))

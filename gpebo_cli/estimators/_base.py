@@ -43,7 +43,6 @@ class _Gain:
     accept: Accepted
     by_parameter: bool
     auto: bool
-    default: float | None
     relative: float | None
 
 
@@ -58,7 +57,7 @@ def gain(
     which one is the least; ``relative``: None stands for this one without a unit, relative to
     something of the data so far, and no case names it.
     """
-    declared = _Gain(accept, by_parameter, auto, default, relative)
+    declared = _Gain(accept, by_parameter, auto, relative)
     return field(default=default, metadata={"gain": declared})
 
 
@@ -88,11 +87,9 @@ class GainEstimator(ABC):
                     axes[f"{own.name}_{key}"] = (number(of_one, f"{where}.{key}", declared.accept),)
             elif declared.auto and is_auto(value):
                 axes[own.name] = (float("nan"),)
-            elif value is None:
-                if declared.relative is None:
-                    axes[own.name] = (declared.default,)
-            else:
-                axes[own.name] = axis(value, where, declared.accept)
+            elif value is not None or declared.relative is None:
+                given = own.default if value is None else value
+                axes[own.name] = axis(given, where, declared.accept)
         return axes
 
     @cached_property
@@ -111,8 +108,7 @@ class GainEstimator(ABC):
             if "gain" in own.metadata and is_auto(getattr(self, own.name)):
                 once: dict[str, Any] = {own.name: 1.0}
                 least = requirement(replace(self, **once)).gain
-                default = own.metadata["gain"].default
-                chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else default
+                chosen[own.name] = _AMPLE * least if 0.0 < least < np.inf else own.default
         return replace(self, **chosen) if chosen else self
 
     def gains(self, name: str, parameters: Sequence[str]) -> Array:
@@ -122,8 +118,9 @@ class GainEstimator(ABC):
         """
         value, where = getattr(self, name), f"estimator.{name}"
         if value is None:
-            declared = type(self).__dataclass_fields__[name].metadata["gain"]
-            value = declared.default if declared.relative is None else declared.relative
+            own = type(self).__dataclass_fields__[name]
+            relative = own.metadata["gain"].relative
+            value = own.default if relative is None else relative
         if is_auto(value):
             raise ConfigError(
                 f"{where}: auto needs to know the signals to their end; give a number with resets "

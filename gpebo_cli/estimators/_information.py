@@ -16,7 +16,7 @@ the diagonal of G_z: it depends on the data so far only, and each parameter is i
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,7 +27,7 @@ from gpebo_cli.evidence.knowledge import own_sizes
 from gpebo_cli.kernels import laws
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.errors import EPS
-from gpebo_cli.numerics.linalg import determinant_and_inverse, transpose
+from gpebo_cli.numerics.linalg import determinant_and_inverse, products_of_others, transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression, interpolation_error
 from gpebo_cli.regression.resets import ExtensionState, level_of
@@ -103,18 +103,17 @@ class InformationAt:
     memory: Array  # (M,); 1 in units of rounding
     units: Array | None = None  # (M, p) in which rounding is 1
 
+    @property
+    def gram(self) -> Array:
+        """G_z (M, p, p), in the units of rounding where nothing is known at the start."""
+        G = self.values[..., : self.values.shape[-2]]
+        return G if self.units is None else G / self.units[..., None] / self.units[:, None]
+
     @cached_property
     def spectrum(self) -> Spectrum:
-        """G_z = V diag(λ) Vᵀ, in the units of rounding where nothing is known at the start."""
-        return self._in_units(self.units)
-
-    def _gram(self, units: Array | None) -> Array:
-        G = self.values[..., : self.values.shape[-2]]
-        return G if units is None else G / units[..., None] / units[:, None]
-
-    def _in_units(self, units: Array | None) -> Spectrum:
-        G, p = self._gram(units), self.values.shape[-2]
-        eigenvalues, vectors = np.linalg.eigh(G)
+        """G_z = V diag(λ) Vᵀ, in the units of :attr:`gram`."""
+        units, p = self.units, self.values.shape[-2]
+        eigenvalues, vectors = np.linalg.eigh(self.gram)
         if units is None:
             rotated = transpose(vectors) @ self.values[..., p:]
             return Spectrum(np.maximum(eigenvalues, 0.0), vectors, rotated, self.memory)
@@ -131,10 +130,8 @@ class InformationAt:
     @cached_property
     def smallest(self) -> float:
         """The smallest eigenvalue of G_z at the last time."""
-        G = self.values[-1, :, : self.values.shape[1]]
-        if self.units is not None:
-            G = G / self.units[-1] / self.units[-1, :, None]
-        return max(float(np.linalg.eigvalsh(G)[0]), 0.0)
+        last = self._some(slice(-1, None))
+        return max(float(np.linalg.eigvalsh(last.gram)[0, 0]), 0.0)
 
     def solution(self, alpha: float, f0: float, start: Array) -> Array:
         """η̂ = (z f₀ I + α G_z)⁻¹ (z f₀ η̂₀ + α h_z), shape (M, p, c).
@@ -159,7 +156,7 @@ class InformationAt:
         With H⁻¹ = I + z f₀ (α G_z)⁻¹, by elimination; by the spectrum where that has no digits and
         somebody ``asked`` (M,).
         """
-        _, inverse, rest = determinant_and_inverse(self._gram(self.units))
+        _, inverse, rest = determinant_and_inverse(self.gram)
         rest &= asked
         added = (self.memory * (f0 / alpha))[:, None, None] * inverse
         delta = 1.0 / np.linalg.det(np.eye(added.shape[1]) + added)
@@ -168,14 +165,15 @@ class InformationAt:
             adjugate /= self.units[..., None] * self.units[:, None]
         if rest.any():
             s = self._some(rest).spectrum
-            delta[rest], weights = s.adjugate(alpha, f0)
-            adjugate[rest] = (s.vectors * weights[:, None]) @ transpose(s.vectors)
+            delta[rest] = s.delta(alpha, f0)
+            weighted = s.vectors * s.adjugate(alpha, f0)[:, None]
+            adjugate[rest] = weighted @ transpose(s.vectors)
             digits[rest] = s.digits
         return delta, adjugate, digits
 
     def covariance(self, alpha: float, f0: float) -> Array:
         """αF = α (z f₀ I + α G_z)⁻¹, (M, p, p), by elimination; as in :class:`Spectrum` else."""
-        G, prior = self._gram(self.units), self.memory * f0
+        G, prior = self.gram, self.memory * f0
         added = prior[:, None, None] * np.eye(G.shape[1])
         _, found, rest = determinant_and_inverse(alpha * G + added)
         if self.units is not None:
@@ -187,7 +185,7 @@ class InformationAt:
             found[rest] = self._some(rest).spectrum.covariance(alpha, f0)
         return found
 
-    def _some(self, chosen: BoolArray) -> InformationAt:
+    def _some(self, chosen: BoolArray | slice) -> InformationAt:
         units = None if self.units is None else self.units[chosen]
         return InformationAt(self.values[chosen], self.memory[chosen], units)
 
@@ -204,7 +202,8 @@ class InformationAt:
         if self.units is not None:
             return self.spectrum
         energy = np.einsum("mii->mi", self.values[..., : self.values.shape[-2]])
-        return self._in_units(np.sqrt(np.where(energy > 0.0, energy, 1.0)))
+        units = np.sqrt(np.where(energy > 0.0, energy, 1.0))
+        return replace(self, units=units).spectrum
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,13 +238,14 @@ class Spectrum:
         """Eigenvalues of αF, (M, p); times those of G_z, what the data decide of each direction."""
         return np.asarray(alpha / (alpha * self.eigenvalues + (self.memory * f0)[:, None]))
 
-    def adjugate(self, alpha: float, f0: float) -> tuple[Array, Array]:
-        """Δ (M,), and adj(H) αF in the eigenbasis of G_z: its diagonal (M, p)."""
+    def delta(self, alpha: float, f0: float) -> Array:
+        """Δ = det H (M,)."""
+        return np.asarray(np.prod(self.eigenvalues * self.share(alpha, f0), axis=1))
+
+    def adjugate(self, alpha: float, f0: float) -> Array:
+        """Of adj(H) αF in the eigenbasis of G_z the diagonal (M, p)."""
         share = self.share(alpha, f0)
-        h, others = share * self.eigenvalues, np.empty_like(share)  # eigenvalues of H
-        for i in range(h.shape[1]):
-            others[:, i] = np.prod(np.delete(h, i, axis=1), axis=1)
-        return np.prod(h, axis=1), others * share
+        return products_of_others(self.eigenvalues * share) * share
 
     def quotient(self) -> tuple[Array, Array]:
         """G_z⁻¹ h_z (M, p, c), zero where it is rounding, and to how many digits (M,)."""
@@ -278,11 +278,11 @@ def information(
     With a bound M ≥ 1/f₀ forgetting is β = β₀ (1 − ‖F‖/M), else β = β₀ ≥ 0, where α and the size of
     f₀ do not matter.
     """
-    level, before = level_of(regression.gram.final), 1.0
-    began = float(regression.mesh.edges[0])
-    if known is not None:
-        level, before = np.maximum(level, known.level), known.memory
-        began = known.began
+    final = regression.gram.final
+    if known is None:
+        began = float(regression.mesh.edges[0])
+        known = ExtensionState(np.zeros_like(final), 0.0, began=began)
+    level, began = np.maximum(level_of(final), known.level), known.began
 
     def units(t: Array, energy: Array, rounding: Array) -> Array:
         return prior_units(energy, regression.terms(t), t - began, rounding)
@@ -292,24 +292,24 @@ def information(
 
     if beta == 0.0:
         gram = regression.gram
-        if known is not None:
+        if known.values.any():  # else it is the regression's own, which is held anyway
             gram = Trajectory(gram.mesh, gram.values + known.values)
-        memory = np.full(regression.mesh.points.shape, before)
+        memory = np.full(regression.mesh.points.shape, known.memory)
         return made(gram, Trajectory(regression.mesh, memory))
     if bound is None:
-        start = None if known is None else beta * known.values
         # β ∫ e^{−β(t−s)} (·) ds
-        filtered = low_pass(regression.outer, np.array(beta), start)
+        filtered = low_pass(regression.outer, np.array(beta), beta * known.values)
         mesh = filtered.mesh
+        memory = known.memory * np.exp(-beta * (mesh.points - mesh.edges[0]))
         # Never 0, beside which what is not excited has a share of 0/0.
-        memory = np.maximum(before * np.exp(-beta * (mesh.points - mesh.edges[0])), _FORGOTTEN)
+        memory = np.maximum(memory, _FORGOTTEN)
         return made(Trajectory(mesh, filtered.values / beta), Trajectory(mesh, memory))
     return made(*_bounded(regression, alpha, f0 or 0.0, beta, bound, known))
 
 
 def _bounded(
     regression: LinearRegression, alpha: float, f0: float, beta0: float, bound: float,
-    known: ExtensionState | None,
+    known: ExtensionState,
 ) -> tuple[Trajectory, Trajectory]:
     """[G_z | h_z] and z with forgetting that stops where ‖F‖ reaches the bound: β = β₀ (1 − ‖F‖/M).
 
@@ -331,10 +331,7 @@ def _bounded(
         outer = mesh.along(outer)
     R, p = mesh.rule.integration, regression.p
     gram, memory = np.empty_like(outer.values), np.empty(outer.values.shape[:2])
-    G, z = np.zeros(outer.values.shape[2:]), 1.0
-    if known is not None:
-        G, z = known.values, known.memory
-    eye = f0 * np.eye(p)
+    G, z, eye = known.values, known.memory, f0 * np.eye(p)
     for k, h in enumerate(mesh.steps):
         gram[k, 0], memory[k, 0] = G, z
         added = outer.values[k, 1:]

@@ -27,6 +27,8 @@ from gpebo_cli.regression.resets import ExtensionState, Known, level_of
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import per_name
 
+_ONE_PERCENT = "1 % of the initial error"
+
 
 def filter_rates(rates: object, parameters: Sequence[str]) -> Array:
     """One λ per parameter, shape (p,); by default 0.1, 0.2, 0.3, …"""
@@ -54,7 +56,7 @@ class FilteredEstimator(ResumableEstimator):
         extended = self.extend(regression, filter_rates(self.rates, regression.parameters), before)
         return mixed_estimates(
             self, regression, (mix(extended, t, regression.floor),),
-            lambda: (reached(self.size(regression), extended, known),), known=known,
+            lambda: (reached(self.size(regression), extended, known),), known,
         )
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
@@ -136,14 +138,15 @@ def reached(size: Array, extended: Trajectory, known: Known) -> ExtensionState:
 
 
 def energy_requirement(
-    condition: str, gain: float, energy: float, needed: float = DECAY,
-    needed_for: str = "1 % of the initial error", of: str = "∫Δ²", *, paced: bool = False,
+    condition: str, gains: Array, energy: float, needed: float,
+    needed_for: str = _ONE_PERCENT, of: str = "∫Δ²", *, paced: bool = False,
 ) -> Requirement:
-    """Whether ∫Δ² is enough at the smallest gain: the error shrinks by e^{−γ∫Δ²}.
+    """Whether ∫Δ² is enough at the smallest gain of (g, 1 or p): the error shrinks by e^{−γ∫Δ²}.
 
     If it is ``paced``, γ is one over the length T of the memory.
     """
-    reached, least = gain * energy, needed / energy if energy > 0.0 else float("inf")
+    gain, least = float(gains.min()), needed / energy if energy > 0.0 else float("inf")
+    reached = gain * energy
     return Requirement(
         name=condition,
         holds=reached >= needed,
@@ -161,8 +164,10 @@ def energy_requirement(
     )
 
 
-def finite_time(mu: float) -> tuple[str, float, str]:
-    """What e^{−γ∫Δ²} ≤ 1 − μ needs: the condition's name, γ∫Δ², and what for."""
+def aim(condition: str, mu: float) -> tuple[str, float, str]:
+    """The condition's name, how much γ∫Δ² is needed, and what for; with μ < 1 e^{−γ∫Δ²} ≤ 1 − μ."""
+    if mu == 1.0:
+        return condition, DECAY, _ONE_PERCENT
     return "IE with enough ∫Δ²", float(-np.log1p(-mu)), "finite-time convergence"
 
 
@@ -177,7 +182,7 @@ class RecursiveMixed:
         condition: str = "Δ not in L2", groups: int = 1, mu: float = 1.0, *, paced: bool = False,
     ) -> None:
         self._mixing, self._paced = mixing, paced
-        self._aim = (condition, DECAY, "1 % of the initial error") if mu == 1.0 else finite_time(mu)
+        self._aim = aim(condition, mu)
         gains = settings.gains("gamma", parameters)
         self._law = ScalarLaw(settings.start(parameters), gains, groups, mu, self._aim[1])
 
@@ -189,8 +194,10 @@ class RecursiveMixed:
     def requirement(self) -> Requirement:
         """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
         condition, needed, what = self._aim
-        gain, energy = float(self._law.gains.min()), float(self._law.energy.min())
-        return energy_requirement(condition, gain, energy, needed, what, paced=self._paced)
+        return energy_requirement(
+            condition, self._law.gains, float(self._law.energy.min()), needed, what,
+            paced=self._paced,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +209,7 @@ class MixedEstimates(Lasting):
     gains: Array  # (g, p or 1)
     condition: str
     at_end: Callable[[], tuple[ExtensionState, ...]]  # of each group; asked for at resets only
-    needed: float = DECAY  # of γ∫Δ²
-    needed_for: str = "1 % of the initial error"
-    mu: float | None = None  # of finite time: w_c = min(e^{−γ∫Δ²}, 1 − μ) of the start is taken out
+    mu: float = 1.0  # of finite time: w_c = min(e^{−γ∫Δ²}, 1 − μ) of the start is taken out
     realisations: tuple[int, ...] = ()
     known: Known = ()  # of each group at the start
     units: Array | float = 1.0  # (p,) in which parameters are comparable
@@ -238,9 +243,10 @@ class MixedEstimates(Lasting):
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² over the horizon: the error has shrunk by its exponential."""
+        condition, needed, what = aim(self.condition, self.mu)
+        paced = self.groups[0].pace is not None
         return energy_requirement(
-            self.condition, float(self.gains.min()), min(self.energies), self.needed,
-            self.needed_for, paced=self.groups[0].pace is not None,
+            condition, self.gains, min(self.energies), needed, what, paced=paced
         )
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
@@ -252,40 +258,33 @@ class MixedEstimates(Lasting):
     def parameters(self, cases: slice, start: Array | None = None) -> Array:
         """η̂ of some cases, shape (g, M, p) or (g, M, p, c), from ``start`` (g, p) if given."""
         g, c = len(self.gains), self.groups[0].quotient.shape[-1] // len(self.start)
-        usual = np.repeat(self.start, c)
         first, last, _ = cases.indices(g * len(self.groups))
+        usual = self.start[None].repeat(c, axis=1)
+        starts = usual.repeat(last - first, axis=0) if start is None else start.repeat(c, axis=1)
         pieces: list[Array] = []
-        done = 0
         for group in range(first // g, (max(last, 1) - 1) // g + 1):
-            path = self.groups[group]
+            path, before = self.groups[group], self.before[group]
             gains = self.gains[max(first - group * g, 0) : min(last - group * g, g)]
             if gains.shape[1] > 1:  # one for each parameter, and for each of its realisations
                 gains = np.repeat(gains, c, axis=1)
-            own = usual
-            if start is not None:
-                own = np.repeat(start[done : done + len(gains)], c, axis=1)
-            done += len(gains)
-            if self.mu is None:
+            own, starts = starts[: len(gains)], starts[len(gains) :]
+            if self.mu == 1.0:
                 pieces.append(self.law(path, own, gains))
                 continue
             # The law goes on from what it had, and not from what was made of it.
-            before, first_one = self.before[group], usual if self.before[group] else own
-            w_c = self._of_start(gains * before) if before else 0.0
+            first_one = usual if before else own
+            w_c = np.minimum(np.exp(-gains * before), 1.0 - self.mu)
             eta = self.law(path, own + w_c * (first_one - own), gains)
-            w_c = self._of_start(gains[:, None] * (before + path.energy_at_t[:, None]))
-            pieces.append((eta - w_c * np.atleast_2d(first_one)[:, None]) / (1.0 - w_c))
+            energy = gains[:, None] * (before + path.energy_at_t[:, None])
+            w_c = np.minimum(np.exp(-energy), 1.0 - self.mu)
+            pieces.append((eta - w_c * first_one[:, None]) / (1.0 - w_c))
         estimates = pieces[0] if len(pieces) == 1 else np.concatenate(pieces)
         return estimates.reshape(*estimates.shape[:2], len(self.start), *self.realisations)
-
-    def _of_start(self, energy: Array) -> Array:
-        """w_c after γ∫Δ² (…)."""
-        return np.asarray(np.minimum(np.exp(-energy), 1.0 - (self.mu or 0.0)))
 
 
 def mixed_estimates(
     settings: GainEstimator, regression: LinearRegression, groups: tuple[ScalarPath, ...],
-    at_end: Callable[[], tuple[ExtensionState, ...]] = tuple, condition: str = "Δ not in L2",
-    known: Known = (),
+    at_end: Callable[[], tuple[ExtensionState, ...]], known: Known, condition: str = "Δ not in L2",
 ) -> MixedEstimates:
     """The estimates with the gains γ of some settings, of mixed regressions."""
     names = regression.parameters

@@ -21,7 +21,12 @@ from gpebo_cli.estimators._information import Spectrum
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, transpose
+from gpebo_cli.numerics.linalg import (
+    affine_scan,
+    determinant_and_adjugate_action,
+    reciprocals,
+    transpose,
+)
 from gpebo_cli.regression.errors import ErrorRecursion
 from gpebo_cli.regression.estimator import SampledEstimates
 from gpebo_cli.regression.samples import Filter, SampledRegression
@@ -76,9 +81,9 @@ def spectrum(root: Array, memory: Array, units: Array | None = None) -> Spectrum
 
 def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
     """𝐘/Δ = G_z⁻¹ h_z (K, p), where it is more than rounding (K,), and G_z⁻¹ there (K, p, p)."""
-    largest = s.eigenvalues[:, -1:] if s.eigenvalues.shape[1] else np.zeros((len(s.memory), 1))
-    usable = (s.eigenvalues > _SINGULAR**2 * largest).all(axis=1) & (largest[:, 0] > 0.0)
-    inverse = np.divide(1.0, s.eigenvalues, out=np.zeros_like(s.eigenvalues), where=usable[:, None])
+    largest = s.eigenvalues.max(axis=1, initial=0.0)
+    usable = (s.eigenvalues > _SINGULAR**2 * largest[:, None]).all(axis=1) & (largest > 0.0)
+    inverse = reciprocals(s.eigenvalues, usable[:, None])
     whole = (s.vectors * inverse[:, None]) @ transpose(s.vectors)
     return (s.vectors @ (inverse[..., None] * s.rotated))[..., 0], usable, whole
 

@@ -24,10 +24,19 @@ names, settings_of, able = _ESTIMATORS.names, _ESTIMATORS.settings_of, _ESTIMATO
 def build(settings: Mapping[str, object]) -> Estimator:
     """The estimator that ``settings["name"]`` asks for, with the remaining keys as its settings.
 
+    Fields of the dataclass annotated ``float`` or ``int`` may be lists or ``logspace(a, b, n)``.
+
     Raises:
         ConfigError: unknown name or key, with the nearest known one.
     """
-    built = spread(_ESTIMATORS.find(settings), settings, _ESTIMATORS.build)
+    several = {key: value for key, value in settings.items() if _is_axis(value)}
+    hints: dict[str, Any] = get_type_hints(_ESTIMATORS.find(settings)) if several else {}
+    chosen = combinations({
+        key: axis(value, f"estimator.{key}", "finite") for key, value in several.items()
+        if hints.get(key) in (float, int)
+    })
+    each = tuple(_ESTIMATORS.build({**settings, **own}) for own in chosen)
+    built = Several(chosen, each) if any(chosen) else each[0]
     _ = built.cases  # gains are read here, so that a wrong one is found before anything is run
     return built
 
@@ -88,25 +97,6 @@ class SeveralEstimates:
             if first < last:
                 found.append(part.parameters(slice(first, last)))
         return np.concatenate(found)
-
-
-def spread(
-    cls: type, settings: Mapping[str, object], build: Callable[[Mapping[str, object]], Estimator]
-) -> Estimator:
-    """The estimator of some settings, of which plain numbers may be lists or ``logspace(a, b, n)``.
-
-    These are fields of the dataclass annotated ``float`` or ``int``; ``build`` makes one estimator.
-    """
-    several = {key: value for key, value in settings.items() if _is_axis(value)}
-    hints: dict[str, Any] = get_type_hints(cls) if several else {}
-    axes = {
-        key: axis(value, f"estimator.{key}", "finite") for key, value in several.items()
-        if hints.get(key) in (float, int)
-    }
-    if not axes:
-        return build(settings)
-    chosen = combinations(axes)
-    return Several(chosen, tuple(build({**settings, **own}) for own in chosen))
 
 
 def _is_axis(value: object) -> bool:

@@ -18,7 +18,7 @@ import numpy as np
 from gpebo_cli import kernels
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action
+from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, reciprocals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
@@ -40,7 +40,7 @@ _LANES = 1 << 22  # numbers in one batch of gains
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
 # there, because its weight in every law is ∫Δ².
 SINGULAR = 1e-14
-_FILTERED, _CUTS = 1e-11, 30  # tail of what a filter follows, and rounds of cuts for it
+_FILTERED = 1e-11  # tail of what a filter follows
 
 
 def kreisselmeier(
@@ -67,7 +67,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     edges = signal.mesh.edges
     smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
     fastest = float(np.max(rate))
-    for _ in range(_CUTS):
+    while True:
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
         # Where elements are short beside the filter, the signal is what is not resolved.
         poor = (mesh.steps * fastest > 0.5) & (mesh.steps > smallest)
@@ -75,9 +75,8 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
             flat = filtered.values.reshape(*filtered.values.shape[:2], -1)
             poor &= unresolved(flat, mesh.rule) > _FILTERED
         if not poor.any():
-            break
+            return filtered
         signal = mesh.split(np.where(poor, 4, 1))[0].along(signal)
-    return filtered
 
 
 def lion(regression: LinearRegression, rates: Array, start: Array | None = None) -> Trajectory:
@@ -138,9 +137,9 @@ def scalar_law(
     From η̂ = ``start``, (p,), or (g, p) for each gain its own, with the gains γ (g, p or 1). In
     ``units`` (p,) parameters are comparable.
     """
+    start = np.broadcast_to(start, (len(gains), start.shape[-1]))
     if not (path.digits > SINGULAR).any():  # nothing is known, and η̂ does not move
-        wide = np.broadcast_to(start, (len(gains), start.shape[-1]))
-        return wide[:, None].repeat(len(path.t), axis=1)
+        return start[:, None].repeat(len(path.t), axis=1)
     seen, own = path.comparable(units), start / units
     variation, size = _variation(seen, float(gains.max(initial=0.0)), own)
     if variation <= _CONSTANT * size and not _drifts(seen, float(gains.max()), size):
@@ -150,10 +149,9 @@ def scalar_law(
     elements = min(path.mesh.size, _STRETCH)
     lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
     batch = max(1, _LANES // lanes)
-    starts = np.broadcast_to(own, (len(gains), start.shape[-1]))
     try:
         return units * np.concatenate([
-            _integrate(seen, starts[i : i + batch], gains[i : i + batch])
+            _integrate(seen, own[i : i + batch], gains[i : i + batch])
             for i in range(0, len(gains), batch)
         ])
     except _UnresolvedError:
@@ -174,9 +172,8 @@ def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, floa
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(quotient[:, 1:] - quotient[:, :-1])
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
-    if much.any():
-        rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
-        change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
+    rounding = _SLACK * _ROUNDING / np.maximum(path.digits[much], _ROUNDING)
+    change[much] -= size * np.maximum(rounding[:, :-1], rounding[:, 1:])[..., None]
     return float((weight * change).max(initial=0.0)), float(size)
 
 
@@ -199,7 +196,7 @@ def constant_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     zero, count = np.zeros_like(final), len(path.t)
     return kernels.laws.stepped_law(
         whole, final, zero, zero, np.zeros(count, dtype=np.intp), path.energy_at_t,
-        np.zeros(count), np.atleast_2d(start), gains,
+        np.zeros(count), start, gains,
     )
 
 
@@ -219,13 +216,10 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
     index = np.clip(np.searchsorted(path.mesh.rule.points, local, side="right") - 1, 0, s - 1)
     step = length[element, index]
     partial = np.clip(path.energy_at_t - energy[element, index], 0.0, step)
-    # At the next point itself the step has no length.
-    there = (partial == step) & (index < s - 1)
-    index, partial = index + there, np.where(there, 0.0, partial)
     share = np.divide(partial, step, out=np.zeros_like(partial), where=partial > 0)
     return kernels.laws.stepped_law(
         length.ravel(), quotient[:, :-1].reshape(-1, p), np.diff(quotient, axis=1).reshape(-1, p),
-        jump.reshape(-1, p), element * s + index, partial, share, np.atleast_2d(start), gains,
+        jump.reshape(-1, p), element * s + index, partial, share, start, gains,
     )
 
 
@@ -377,7 +371,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
-    digits = np.divide(1.0, condition, out=np.zeros(len(condition)), where=usable)
+    digits = reciprocals(condition, usable)
     return scalar_path(
         extended.mesh, signals, delta.reshape(points), digits.reshape(points),
         filled(quotient.reshape(*points, -1), usable), t, floor,

@@ -104,27 +104,26 @@ class VectorLaw:
         )
         return solve(
             problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
-            restarts=_residual_restarts(packed, p) if residual else {},
+            restarts=_residual_restarts(packed) if residual else {},
         ).trajectory
 
 
-def _residual_restarts(packed: Trajectory, p: int) -> dict[float, Callable[[Array], Array]]:
+def _residual_restarts(packed: Trajectory) -> dict[float, Callable[[Array], Array]]:
     """What becomes of (η̂, ν) at the edges where the signals [M ; N ; b] jump."""
     before, after = packed.values[:-1, -1], packed.values[1:, 0]
     size = np.abs(packed.values).max(axis=(0, 1))
     jumps = (np.abs(after - before) > _ROUNDING * size).any(axis=(1, 2))
-    def restart(signals: Array, state: Array) -> Array:
-        return _with_residual(signals, state[:p])
-
     return {
-        float(packed.mesh.edges[k + 1]): partial(restart, after[k]) for k in np.flatnonzero(jumps)
+        float(packed.mesh.edges[k + 1]): partial(_with_residual, after[k])
+        for k in np.flatnonzero(jumps)
     }
 
 
-def _with_residual(signals: Array, eta: Array) -> Array:
-    """(η̂, ν) from η̂ (p, c) and [M | N | b] (k, 2p + c) at one time."""
-    p = len(eta)
-    return np.concatenate([eta, signals[:, 2 * p :] - signals[:, p : 2 * p] @ eta])
+def _with_residual(signals: Array, state: Array) -> Array:
+    """(η̂, ν) from η̂ (p, c), or more rows below it, and [M | N | b] (k, 2p + c) at one time."""
+    p = (signals.shape[1] - state.shape[1]) // 2
+    eta, (_, N, b) = state[:p], np.split(signals, [p, 2 * p], axis=1)
+    return np.concatenate([eta, b - N @ eta])
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,7 @@ from gpebo_cli.estimators._scalar import ScalarPath, filled, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
+from gpebo_cli.numerics.linalg import reciprocals
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
@@ -79,19 +80,14 @@ class Exciting(WindowedEstimator):
             path.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
         ).trajectory
 
-        def digits(delta: Array) -> Array:
-            return np.minimum(np.abs(delta), 1.0)
-
         def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             values = found(t, inside)[:, 1]
-            return values[:, 0], values[:, 1:], digits(values[:, 0])
+            return values[:, 0], values[:, 1:], np.abs(values[:, 0])
 
         new, right = found.values[:, :, 1, 0], found.values[:, :, 1, 1:]
         usable = np.abs(new) > _KNOWN
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
-        law = scalar_path(
-            found.mesh, signals, new, digits(new), quotient, np.asarray(t), path.floor
-        )
+        law = scalar_path(found.mesh, signals, new, np.abs(new), quotient, t, path.floor)
         (end,) = inner.at_end()
         end = replace(end, turned=found.final)
         return replace(inner, groups=(law,), condition="IE", at_end=lambda: (end,))
@@ -157,7 +153,7 @@ class Rotation:
         self._turned = turned[-1]
         known = new > _KNOWN
         e_2 = (turned * np.exp(1j * phi[1:, None])).imag
-        inverse = np.divide(1.0, new, out=np.zeros_like(new), where=known)
+        inverse = reciprocals(new, known)
 
         def errors() -> tuple[list[Filter], list[Array]]:
             (own,), (Q,) = mixed.behind()

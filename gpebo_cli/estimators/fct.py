@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import product
 from typing import Literal
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._mixed import MixedEstimates, finite_time
+from gpebo_cli.estimators._mixed import MixedEstimates
 from gpebo_cli.estimators._scalar import ScalarPath
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.estimators.ls_drem import LsDrem
@@ -69,12 +70,11 @@ class FiniteTime(ResumableEstimator):
             found = errors(t, inside)
             return found._replace(C=found.C / (1.0 - w_c)[..., None])
 
+        errors = self.inner.errors(regression, known)
+        pairs = product(zip(inner.groups, inner.before, strict=True), gains)
         return tuple(
-            partial(
-                at, errors, inner.groups[i // len(gains)], inner.before[i // len(gains)],
-                gains[i % len(gains)],
-            )
-            for i, errors in enumerate(self.inner.errors(regression, known))
+            partial(at, own, *group, gain)
+            for own, (group, gain) in zip(errors, pairs, strict=True)
         )
 
     def recursive(self, parameters: Sequence[str]) -> Recursion:
@@ -86,11 +86,7 @@ class FiniteTime(ResumableEstimator):
 
         After a reset the law starts anew from the corrected estimate.
         """
-        condition, needed, needed_for = finite_time(float(self.mu))
-        return replace(
-            self.inner.resume(regression, t, known), mu=float(self.mu), condition=condition,
-            needed=needed, needed_for=needed_for,
-        )
+        return replace(self.inner.resume(regression, t, known), mu=float(self.mu))
 
 
 ESTIMATOR = FiniteTime

@@ -48,7 +48,7 @@ def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) 
 
 
 def averaged(
-    regression: LinearRegression, delay: float, settle: float, before: Array | float = 0.0
+    regression: LinearRegression, delay: float, settle: float, before: Array | float
 ) -> Trajectory:
     """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
 
@@ -106,7 +106,7 @@ class Instrumental(WindowedEstimator):
         square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
         path = mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor)
         return mixed_estimates(
-            self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known=known
+            self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known
         )
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
@@ -132,7 +132,7 @@ class SampledMeans:
 
     def __init__(self, settings: Instrumental, parameters: Sequence[str]) -> None:
         self._settings, self._names = settings, parameters
-        self._delay, self._span = settings.delay, settings.settle  # T₀ + t − t₀
+        self._span = settings.settle  # T₀ + t − t₀
         p = len(parameters)
         self._sums = np.zeros((2 * p, p + 1))
         self._past: Past | None = None
@@ -142,13 +142,13 @@ class SampledMeans:
     def update(self, regression: SampledRegression) -> Mixed:
         """Δ and η̄ at K samples."""
         t, p, rows = regression.t, regression.p, regression.rows
-        psi = rows[..., :p]
+        psi, delay = rows[..., :p], self._settings.delay
         flat = psi[1:].reshape(len(t), -1)
         past = (t[:1], flat[:1]) if self._past is None else self._past
-        late, self._past = delayed(past, t, flat, self._delay, regression.hold)
+        late, self._past = delayed(past, t, flat, delay, regression.hold)
         self._start = t[0] if self._start is None else self._start
         old, new = regression.shares
-        since = t - self._delay - self._start  # ψ(t − d) sets in within a step
+        since = t - delay - self._start  # ψ(t − d) sets in within a step
         of_late = np.where((since >= 0.0) & (since < regression.steps), since, new)
         old, new = old[:, None, None], np.repeat(np.stack([new, of_late], 1), p, axis=1)[..., None]
         before = np.zeros_like(late[:1]) if self._late is None else self._late

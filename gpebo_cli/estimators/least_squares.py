@@ -23,7 +23,7 @@ from gpebo_cli.estimators._information import (
 from gpebo_cli.estimators._recursive import InformationRoot, spectrum
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import reciprocals, transpose
 from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
 from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found, Lasting, SampledEstimates, Unmixed
@@ -135,8 +135,7 @@ class LeastSquares(ResumableEstimator):
                 "accepted: estimator.bound=null"
             )
         p = regression.p
-        start = self.start(regression.parameters)
-        prior = np.column_stack([np.eye(p), start])
+        prior = np.column_stack([np.eye(p), self.start(regression.parameters)])
         ones, begin = np.ones(p), (regression.whole or regression).mesh.edges[0]
         reached = list[ExtensionState]()
 
@@ -150,8 +149,7 @@ class LeastSquares(ResumableEstimator):
             gram = found(t)
             if "f0" not in case:
                 energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
-                elapsed = t - begin
-                units = prior_units(energy, regression.terms(t), elapsed, rounding)
+                units = prior_units(energy, regression.terms(t), t - begin, rounding)
                 gram += units[..., None] ** 2 * prior
             return gram
 
@@ -183,7 +181,7 @@ def solved(extended: Array, units: Array) -> Found:
     size = np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
     eigenvalues, V = np.linalg.eigh(extended[..., :-1] / size / transpose(size))
     told = eigenvalues > _DIGITS * eigenvalues[..., -1:]
-    share = np.where(told, 1.0 / np.where(told, eigenvalues, 1.0), 0.0)[..., None]
+    share = reciprocals(eigenvalues, told)[..., None]
     eta = V @ (share * (transpose(V) @ (extended[..., -1:] / size))) / size
     final = np.linalg.svd(extended[:, -1, :, :-1] * units * units[:, None], compute_uv=False)
     worst = float((final[:, -1] / final[:, 0]).min())
@@ -275,26 +273,24 @@ class RecursiveLeastSquares:
 
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each."""
-        spectra, _ = self.spectra(regression)
+        pairs = list(zip(self._cases, self.spectra(regression)[0], strict=True))
         ratios = np.min([
             case["alpha"] * s.eigenvalues.min(axis=1, initial=np.inf) / (f0_of(case) * s.memory)
-            for case, s in zip(self._cases, spectra, strict=True)
+            for case, s in pairs
         ], axis=0)
         self._ratio = float(ratios[-1])
-        solved = [
-            s.solution(case["alpha"], f0_of(case), self._start)
-            for case, s in zip(self._cases, spectra, strict=True)
-        ]
+        eta = np.array([s.solution(case["alpha"], f0_of(case), self._start) for case, s in pairs])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂ = αF δh_z."""
-            filters = [integrating(regression, case["beta"]) for case in self._cases]
             return tuple(
-                ErrorRecursion(*own, s.covariance(case["alpha"], f0_of(case)))
-                for own, case, s in zip(filters, self._cases, spectra, strict=True)
+                ErrorRecursion(
+                    *integrating(regression, case["beta"]), s.covariance(case["alpha"], f0_of(case))
+                )
+                for case, s in pairs
             )
 
-        return SampledEstimates(np.array(solved)[..., 0], None, errors, ratios >= _NEEDED)
+        return SampledEstimates(eta[..., 0], None, errors, ratios >= _NEEDED)
 
     @property
     def requirement(self) -> Requirement:

@@ -13,12 +13,7 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import (
-    Information,
-    InformationAt,
-    Spectrum,
-    check_held,
-)
+from gpebo_cli.estimators._information import Information, InformationAt, Spectrum, check_held
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
@@ -112,10 +107,9 @@ class LsDrem(ResumableEstimator):
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
-        part, cases = self.least_squares.recursive(parameters), self.least_squares.cases
-        mixing = partial(_mixed, part, cases, self.gamma is None)
-        paced = self.gamma is None
-        return RecursiveMixed(self, parameters, mixing, "IE", len(cases), mu, paced=paced)
+        part, paced = self.least_squares, self.gamma is None
+        mixing = partial(_mixed, part.recursive(parameters), part.cases, paced)
+        return RecursiveMixed(self, parameters, mixing, "IE", len(part.cases), mu, paced=paced)
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Mix every combination of α, f₀, β at the times t (M,), each with a path of its own."""
@@ -131,7 +125,7 @@ class LsDrem(ResumableEstimator):
             for info, case in zip(infos, part.cases, strict=True)
         )
         return mixed_estimates(
-            self, regression, groups, lambda: tuple(info.reached for info in infos), "IE", known
+            self, regression, groups, lambda: tuple(info.reached for info in infos), known, "IE"
         )
 
 
@@ -148,16 +142,14 @@ def _mixed(
     """Least squares at samples, and mixing; a group for each of its cases."""
     spectra, elapsed = part.spectra(regression)
     delta = [
-        np.prod(s.eigenvalues * s.share(case["alpha"], f0_of(case)), axis=1)
-        for s, case in zip(spectra, cases, strict=True)
+        s.delta(case["alpha"], f0_of(case)) for s, case in zip(spectra, cases, strict=True)
     ]
     quotient, usable, inverse = zip(*map(quotient_of, spectra), strict=True)
     return Mixed(
         np.stack(delta, axis=1), np.stack(quotient, axis=1), np.stack(usable, axis=1),
         lambda: ([integrating(regression, case["beta"]) for case in cases], inverse),
-        np.stack([
-            one_over_memory(elapsed, case["beta"]) for case in cases
-        ], axis=1) if paced else 1.0,
+        np.stack([one_over_memory(elapsed, case["beta"]) for case in cases], axis=1)
+        if paced else 1.0,
     )
 
 
@@ -177,7 +169,7 @@ def mix_least_squares(
         Y = delta[:, None, None] * quotient
         if info.units is None:
             known = (digits > SINGULAR)[:, None, None]
-            Y = np.where(known, Y, s.vectors @ (s.adjugate(alpha, f0)[1][..., None] * s.rotated))
+            Y = np.where(known, Y, s.vectors @ (s.adjugate(alpha, f0)[..., None] * s.rotated))
         return delta, Y.reshape(len(t), -1), digits
 
     shape = mesh.points.shape
@@ -201,9 +193,8 @@ def _mixed_at(
 
     The quotient is solved in parameters' own units: others may hide most digits.
     """
-    delta = np.prod(at.spectrum.eigenvalues * at.spectrum.share(alpha, f0), axis=1)
     quotient, digits = at.in_own_units.quotient()
-    return delta, quotient, digits, at.spectrum
+    return at.spectrum.delta(alpha, f0), quotient, digits, at.spectrum
 
 
 ESTIMATOR = LsDrem

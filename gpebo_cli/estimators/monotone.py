@@ -159,11 +159,8 @@ class MonotoneEstimates:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        return _requirement(self.gains, float(self.path.energy_at_t[-1]), self.mu)
-
-
-def _requirement(gains: Array, energy: float, mu: float) -> Requirement:
-    return energy_requirement("Δ not in L2", float(gains.min()), energy, DECAY / mu)
+        energy = float(self.path.energy_at_t[-1])
+        return energy_requirement("Δ not in L2", self.gains, energy, DECAY / self.mu)
 
 
 class RecursiveMonotone:
@@ -184,8 +181,7 @@ class RecursiveMonotone:
     def update(self, regression: SampledRegression) -> SampledEstimates:
         """Take K samples and give the estimates at each; nobody knows how errors go through."""
         if self._theta is None:
-            S, T, self._mu, start = self._settings.law(regression.parametrisation)
-            self._S, self._T = S, T
+            self._S, self._T, self._mu, start = self._settings.law(regression.parametrisation)
             self._theta = np.tile(start, (len(self._gains), 1))
         mixed = self._mixing(regression)
         energy, goal, _ = self._steps.means(regression, mixed.delta**2, mixed)
@@ -232,7 +228,7 @@ class RecursiveMonotone:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² so far."""
-        return _requirement(self._gains, self._energy, self._mu)
+        return energy_requirement("Δ not in L2", self._gains, self._energy, DECAY / self._mu)
 
 
 ESTIMATOR = Monotone

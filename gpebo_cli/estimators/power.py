@@ -103,7 +103,7 @@ class PowerEstimates(MixedEstimates):
         (path,), (energy,) = self.groups, self.energies
         start = np.repeat(self.start, path.quotient.shape[-1] // len(self.start))
         error = float(np.abs(path.quotient[-1, -1] - start).max(initial=0.0))
-        return power_requirement(self.alpha, float(self.gains.min()), energy, error)
+        return power_requirement(self.alpha, self.gains, energy, error)
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) at the path's times, from ``start`` (P,) or (g, P), for gains (g, P or 1).
@@ -284,16 +284,14 @@ class RecursivePower:
     @property
     def requirement(self) -> Requirement:
         """γ∫|Δ|^{1+α} so far."""
-        return power_requirement(
-            self._alpha, float(self._gains.min()), self._energy, self._error
-        )
+        return power_requirement(self._alpha, self._gains, self._energy, self._error)
 
 
-def power_requirement(alpha: float, gain: float, energy: float, error: float) -> Requirement:
-    """γ∫|Δ|^{1+α} against what errors of the start of this size need to be zero."""
+def power_requirement(alpha: float, gains: Array, energy: float, error: float) -> Requirement:
+    """γ∫|Δ|^{1+α}, gains (g, 1 or p), against what errors of the start so large need to be zero."""
     needed = max(error ** (1.0 - alpha) / (1.0 - alpha), 1e-300)
     return energy_requirement(
-        "IE with enough ∫|Δ|^(1+α)", gain, energy, needed, "finite-time convergence", "∫|Δ|^(1+α)"
+        "IE with enough ∫|Δ|^(1+α)", gains, energy, needed, "finite-time convergence", "∫|Δ|^(1+α)"
     )
 
 

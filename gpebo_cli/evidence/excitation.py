@@ -123,10 +123,10 @@ def assess(
         return np.maximum(symmetric_eigenvalues(gram), 0.0)
 
     return Excitation(
-        t, window, settings.rho, regression.parameters, _known(regression, t[-1:], tol, end),
+        t, window, settings.rho, regression.parameters, known_at(regression, t[-1:], tol, end),
         t_c=partial(_t_c, later, settings.rho, tol, ends),
         lambda_min=lambda: float(eigenvalues(end[0])[0, 0]) if later.p else 0.0,
-        known=lambda: _known(later, t, tol, seen()),
+        known=lambda: known_at(later, t, tol, seen()),
         gram_eigenvalues=lambda: eigenvalues(seen()[0]),
         pe_level=lambda: window_level(
             ((part.outer for part in segment.windows()) for segment in later.segments), t, window,
@@ -135,23 +135,18 @@ def assess(
     )
 
 
-def known_at(regression: LinearRegression, at: Array, tol: float) -> Knowledge:
-    """What is known at some times (N,) from ψ, resolved to ``tol``."""
-    return _known(regression, at, tol, regression.gram_with_rounding(at))
-
-
-def _known(
-    regression: LinearRegression, at: Array, tol: float, seen: tuple[Array, Array]
+def known_at(
+    regression: LinearRegression, at: Array, tol: float,
+    seen: tuple[Array, Array | float] | None = None,
 ) -> Knowledge:
-    """:func:`known_at` from [G | h] with its rounding there."""
-    gram, rounding = seen
+    """What is known at some times (N,) from ψ, resolved to ``tol``.
+
+    ``seen`` are [G | h] and its rounding there, where they are at hand.
+    """
+    gram, rounding = seen or regression.gram_with_rounding(at)
     rounding = rounding + regression.rounding_of(gram)
-    return knowledge(gram, *_beside(regression, at), tol, rounding)
-
-
-def _beside(regression: LinearRegression, at: Array) -> tuple[Array, Array]:
-    """What sizes at some times (N,) are compared with, see :func:`knowledge`."""
-    return regression.terms(at), at - regression.mesh.edges[0]
+    elapsed = at - regression.mesh.edges[0]
+    return knowledge(gram, regression.terms(at), elapsed, tol, rounding)
 
 
 def _told(
@@ -159,11 +154,10 @@ def _told(
     rounding: Array | float = 0.0,
 ) -> tuple[Array, Array]:
     """How well all are told apart, or λ_min over ρ, and what of that may be rounding, (M,) each."""
-    rounding = rounding + regression.rounding_of(matrices)
     if rho is not None:
-        level = rounding.max(axis=1, initial=_TINY)
+        level = (rounding + regression.rounding_of(matrices)).max(axis=1, initial=_TINY)
         return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
-    known = knowledge(matrices, *_beside(regression, at), tol, rounding)
+    known = known_at(regression, at, tol, (matrices, rounding))
     return known.smallest, known.rounding
 
 

@@ -74,7 +74,11 @@ def measure_squares(
     """
     out = np.full((5, len(of_eta)), np.nan)
     seen, known = judged & ~np.isnan(of_eta[0]), ~np.isnan(of_x[0])
-    times = _norms_settled(t, squares, None if last is None else last.T)
+    # As in `levels`, a norm that starts at rounding is to stay below 1 % of one.
+    first = np.array([each[:, 0] for each in squares])
+    some = first > _NOTHING**2
+    level = SETTLED**2 * np.where(some, first, 1.0)
+    times = _settled(t, squares, level, last.T if last is not None and some.all() else None)
     if seen.any() or not judged.any():
         out[0] = times[0]
         out[2] = np.abs(of_eta[:, seen]).max(axis=1, initial=0.0)
@@ -83,17 +87,6 @@ def measure_squares(
         out[3] = np.abs(of_x[:, known]).max(axis=1)
         out[4] = time_rms(t, squares[1])
     return out
-
-
-def _norms_settled(t: Array, squares: Sequence[Array], last: Array | None) -> Array:
-    """:func:`settling_times` (2, G) of two norms in units of sizes, from their squares (G, M) each.
-
-    As in :func:`levels`, a norm that starts at rounding is to stay below 1 % of one.
-    """
-    first = np.array([each[:, 0] for each in squares])
-    some = first > _NOTHING**2
-    level = SETTLED**2 * np.where(some, first, 1.0)
-    return _settled(t, squares, level, last if some.all() else None)
 
 
 def levels(first: Array, size: Array) -> Array:

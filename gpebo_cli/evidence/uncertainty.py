@@ -22,7 +22,7 @@ from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import among
-from gpebo_cli.numerics.linalg import transpose, triangular
+from gpebo_cli.numerics.linalg import reciprocals, transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Sampler
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
@@ -71,17 +71,18 @@ def deviations(
     where errors move s so fast that rounding decides how slow the rest of it is.
     """
     most = 1 if resets else len(rows.t) // _GROUPS
-    per, before = _PER_ELAPSED, list[Array]()
+    per, p = _PER_ELAPSED, gain.shape[2]
+    before: Array | None = None
     anew = edges[:1] if starts is None else starts
     while True:
         groups = grouped(rows, edges[-1], t, anew, most, per)
         found = _propagated(
             observer, estimator, gain, edges, groups, variances, t, anew, resets
         )
-        if groups.alone or (before and all(map(_agree, before, found))):
-            return found[0], found[1]
-        finer = 4 if before else 2
-        before, most, per = [*found], most // finer, per * finer
+        if groups.alone or (before is not None and _agree(before, found)):
+            return found[:, :p], found[:, p:]
+        finer = 2 if before is None else 4
+        before, most, per = found, most // finer, per * finer
 
 
 def _agree(coarse: Array, fine: Array) -> bool:
@@ -93,16 +94,11 @@ def _agree(coarse: Array, fine: Array) -> bool:
 def _propagated(
     observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
     variances: Array, t: Array, starts: Array, resets: Sequence[tuple[float, Array]],
-) -> tuple[Array, Array]:
-    """:func:`deviations` of grouped rows; the gain is (M, n, p)."""
+) -> Array:
+    """:func:`deviations` of grouped rows, side by side (M, p + n); the gain is (M, n, p)."""
     n, p = gain.shape[1:]
-    begun = np.union1d(starts, [time for time, _ in resets])
-    mesh = _mesh(edges, groups, begun)
-    anew = mesh.edges[np.searchsorted(mesh.edges, starts)]
-    turns = {float(mesh.edges[np.searchsorted(mesh.edges, time)]): turn for time, turn in resets}
-    cut_until = mesh.edges[(np.searchsorted(mesh.edges, begun) + _FIRST).clip(max=mesh.size)]
-    chain = _Chain(observer, estimator, n, groups, variances, anew, turns, (begun, cut_until))
-    of_eta, of_x = np.empty((len(t), p)), np.empty((len(t), n))
+    chain = _Chain(observer, estimator, n, edges, groups, variances, starts, resets)
+    mesh, found = chain.mesh, np.empty((len(t), p + n))
     stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
     cuts = mesh.edges[stretch:-1:stretch]
     all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
@@ -110,7 +106,7 @@ def _propagated(
         part = Mesh(mesh.edges[first : first + stretch + 1], mesh.rule)
         part, joint = chain.looked(part, t[chosen])
         if chain.rate * (edges[-1] - edges[0]) > _FASTEST:
-            return np.full(of_eta.shape, np.nan), np.full(of_x.shape, np.nan)
+            return np.full(found.shape, np.nan)
         part, maps, factors, (common, varies) = chain.along(part, joint, t[chosen])
         if not len(chosen):
             continue
@@ -135,13 +131,11 @@ def _propagated(
         out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
         out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
         out[:, p:, :zeta], out[:, p:, size:] = o.C[:, rows:], o.D[:, rows:]
-        found = _sizes(out @ here @ before)
-        of_eta[chosen], of_x[chosen] = found[:, :p], found[:, p:]
+        found[chosen] = _sizes(out @ here @ before)
     if chain.unknown:  # one row alone says nothing of that, but rounding does
         row = groups.after[0] - groups.starts[0]
-        for each in (of_eta, of_x):
-            each[t < groups.after[0] + _SNAP * row] = np.nan
-    return of_eta, of_x
+        found[t < groups.after[0] + _SNAP * row] = np.nan
+    return found
 
 
 def _sizes(rows: Array) -> Array:
@@ -157,31 +151,32 @@ class _Chain:
     unknown = False  # whether C is NaN at the start
 
     def __init__(
-        self, observer: ErrorsAt, estimator: ErrorsAt, n: int, groups: Groups, variances: Array,
-        anew: Array, turns: Mapping[float, Array], cuts: tuple[Array, Array],
+        self, observer: ErrorsAt, estimator: ErrorsAt, n: int, edges: Array, groups: Groups,
+        variances: Array, starts: Array, resets: Sequence[tuple[float, Array]],
     ) -> None:
-        """Prepare for the first element.
-
-        All errors begin anew at edges ``anew``; at those of ``turns`` s is made of [ζ; s], and ζ is
-        zero. Elements may be ``cuts`` from times of the first kind to those of the second.
-        """
+        """Prepare for the first element, of n states; the others are as of :func:`deviations`."""
         self._observer = self.observer = observer  # asked once where it is alike at all times
-        self._behind, self._groups, self._anew, self._turns = (
-            (estimator, n), groups, anew.tolist(), turns
-        )
+        self._estimator, self._n, self._groups = estimator, n, groups
+        begun = np.union1d(starts, [time for time, _ in resets])
+        self.mesh = mesh = _mesh(edges, groups, begun)
+        # At some edges all errors begin anew, at others s is made of [ζ; s], and ζ is zero.
+        self._anew = mesh.edges[mesh.edges.searchsorted(starts)].tolist()
+        self._turns = {float(mesh.edges[mesh.edges.searchsorted(at)]): turn for at, turn in resets}
+        # Elements may be cut from times of the first kind to those of the second.
+        until = mesh.edges[(mesh.edges.searchsorted(begun) + _FIRST).clip(max=mesh.size)]
+        self._cuts = begun, until
         # The errors that count from the start of each group on.
         beside = groups.first[:, None] + np.arange(1 + groups.memory.shape[1])
         beside = beside.clip(max=len(groups.shares) - 1)
         self.shares, self._memory = groups.shares[beside], groups.memory[beside]
         self._deviations = self.shares[..., None] * np.sqrt(variances)
         self._until = np.append(groups.starts[1:], np.inf)
-        self._cuts = cuts
         self._L: Array | None = None
         self._group = -1  # the last one
 
     def looked(self, mesh: Mesh, t: Array) -> tuple[Mesh, ErrorSystem]:
         """The next elements with layers where times t (M,) are, and their joint system."""
-        joint, o = _joint(self._observer, *self._behind, mesh, slice(None))
+        joint, o = self._joint(self._observer, mesh)
         if self._group < 0:
             self.unknown = bool(np.isnan(joint.C[0]).any())
         self.zeta, alike = o.A.shape[1], all(len(part) == 1 for part in o)
@@ -191,7 +186,7 @@ class _Chain:
         layered = _layered(mesh, self._groups.starts, self.rate, t)
         if layered.size == mesh.size:
             return mesh, joint
-        return layered, _joint(self.observer, *self._behind, layered, slice(None))[0]
+        return layered, self._joint(self.observer, layered)[0]
 
     def along(
         self, mesh: Mesh, joint: ErrorSystem, t: Array
@@ -230,13 +225,35 @@ class _Chain:
                 return mesh, maps, factors, (common, varies)
             mesh, kept = mesh.split(wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages))
             maps, varies, new, cuts = maps[kept], varies[kept], kept < 0, cuts + 1
-            joint = _joint(self.observer, *self._behind, mesh, new)[0]
+            joint = self._joint(self.observer, mesh, new)[0]
+
+    def _joint(
+        self, observer: ErrorsAt, mesh: Mesh, part: BoolArray | slice = slice(None)
+    ) -> tuple[ErrorSystem, ErrorSystem]:
+        """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at nodes of some elements, and C of s.
+
+        Beside it stands the system of ζ at all of these nodes.
+        """
+        points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
+        o, e = observer(points, inside), self._estimator(points, inside)
+        zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
+        rows = o.C.shape[1] - self._n
+        A = np.zeros((len(points), zeta + own, zeta + own))
+        A[:, :zeta, :zeta] = o.A
+        A[:, zeta:, :zeta] = e.B @ o.C[:, :rows]
+        A[:, zeta:, zeta:] = e.A
+        B = np.zeros((len(points), zeta + own, signals))
+        B[:, :zeta] = o.B
+        B[:, zeta:] = e.B @ o.D[:, :rows]
+        shape = (-1, mesh.rule.stages, zeta + own)
+        system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
+        return system, o
 
     def _turned(self, left: Array, maps: Array) -> dict[int, Array]:
         """What makes [ζ; s] of itself (d, d) at the ``left`` ends of some elements, by number."""
         zeta, eye = self.zeta, np.eye(maps.shape[2])[self.zeta :]
         eye[:, :zeta] = 0.0
-        edges = dict.fromkeys(self._anew, eye) | dict(self._turns)
+        edges = dict.fromkeys(self._anew, eye) | self._turns
         return {
             k: np.pad(edges[time], ((zeta, 0), (0, 0)))
             for k, time in enumerate(left.tolist()) if time in edges
@@ -291,10 +308,9 @@ def of_least_squares(
     numbers mean nothing. The regression has no resets, ``known`` is of G with the end last, and the
     ``gain`` is that of the state at the end (n, p); the others are as of :func:`deviations`.
     """
-    mesh, V = regression.mesh, known.vectors[-1]
+    mesh, V, sizes = regression.mesh, known.vectors[-1], known.sizes[-1]
     seen = known.eigenvalues[-1] >= known.level[-1].max(initial=0.0)
-    inverse = np.where(seen, 1.0 / np.where(seen, known.eigenvalues[-1], 1.0), 0.0)
-    inverse = (V * inverse) @ V.T / known.sizes[-1] / known.sizes[-1][:, None]
+    inverse = (V * reciprocals(known.eigenvalues[-1], seen)) @ V.T / sizes / sizes[:, None]
     of_eta, of_x = deviations(
         observer, _sums(regression, inverse), gain[None], mesh.edges, rows, variances,
         mesh.edges[-1:],
@@ -348,7 +364,7 @@ def noise_level(
         )
     _, sigma, Vt = np.linalg.svd(root[:, :p], full_matrices=False)
     known = sigma > np.sqrt(_SINGULAR) * sigma.max(initial=0.0)
-    inverse = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[:, None] * Vt
+    inverse = reciprocals(sigma, known)[:, None] * Vt
 
     def of_Y(t: Array, inside: Array) -> ErrorSystem:
         o = observer(t, inside)
@@ -523,29 +539,6 @@ def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) 
     return out
 
 
-def _joint(
-    observer: ErrorsAt, estimator: ErrorsAt, n: int, mesh: Mesh, part: BoolArray | slice
-) -> tuple[ErrorSystem, ErrorSystem]:
-    """A (K, s, d, d) and B (K, s, d, m + r) of [ζ; s] at nodes of some elements, and C of s.
-
-    Beside it stands the system of ζ at all of these nodes.
-    """
-    points, inside = mesh.points[part, 1:].ravel(), mesh.inside[part, 1:].ravel()
-    o, e = observer(points, inside), estimator(points, inside)
-    zeta, own, signals = o.A.shape[1], e.A.shape[1], o.B.shape[2]
-    rows = o.C.shape[1] - n
-    A = np.zeros((len(points), zeta + own, zeta + own))
-    A[:, :zeta, :zeta] = o.A
-    A[:, zeta:, :zeta] = e.B @ o.C[:, :rows]
-    A[:, zeta:, zeta:] = e.A
-    B = np.zeros((len(points), zeta + own, signals))
-    B[:, :zeta] = o.B
-    B[:, zeta:] = e.B @ o.D[:, :rows]
-    shape = (-1, mesh.rule.stages, zeta + own)
-    system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
-    return system, o
-
-
 def _factors(
     ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, memory: Array,
     L: Array | None, turns: Mapping[int, Array],
@@ -687,7 +680,7 @@ class SampledDeviations:
         self._expected, self._square = float(expected[-1]), float(of_Y[-1])
         _, sigma, Vt = np.linalg.svd(roots[:, :-1, :-1])
         known = sigma**2 > _SINGULAR * sigma[:, :1] ** 2
-        fitted = np.where(known, 1.0 / np.where(known, sigma, 1.0), 0.0)[..., None] * (Vt @ of_h)
+        fitted = reciprocals(sigma, known)[..., None] * (Vt @ of_h)
         left = expected - (fitted**2).sum(axis=(1, 2))
         left[left <= _LEFT * expected] = np.nan
         return np.asarray(np.abs(roots[:, -1, -1]) / np.sqrt(left))

@@ -37,6 +37,11 @@ def transpose(a: Array) -> Array:
     return np.swapaxes(a, -1, -2)
 
 
+def reciprocals(values: Array, known: BoolArray) -> Array:
+    """1/values (…,) where they are ``known``, a mask that broadcasts to them, and 0 elsewhere."""
+    return np.divide(1.0, values, out=np.zeros_like(values), where=known)
+
+
 def largest_within(values: Array) -> Array:
     """Largest sizes (K, …) of values (K, points, …)."""
     found = signals.largest(values.reshape(*values.shape[:2], prod(values.shape[2:])))
@@ -83,6 +88,14 @@ def orthonormal_complement(basis: Array) -> Array:
     return np.eye(basis.shape[-2]) - basis @ transpose(basis)
 
 
+def products_of_others(factors: Array) -> Array:
+    """∏_{j≠i} of factors (…, p), for each i, by prefix and suffix products: no division."""
+    ones = np.ones((*factors.shape[:-1], 1))
+    before = np.concatenate([ones, np.cumprod(factors[..., :-1], axis=-1)], axis=-1)
+    after = np.concatenate([np.cumprod(factors[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
+    return np.asarray(before * after)
+
+
 def determinant_and_adjugate_action(
     omega: Array, rhs: Array | None = None
 ) -> tuple[Array, Array, Array]:
@@ -93,18 +106,14 @@ def determinant_and_adjugate_action(
     at Ω = 0. Beside both stands the reciprocal condition number σ_min/σ_max (...,), zero where Ω =
     0.
     """
-    p = omega.shape[-1]
     if rhs is None:
-        rhs = np.broadcast_to(np.eye(p), omega.shape)
+        rhs = np.broadcast_to(np.eye(omega.shape[-1]), omega.shape)
     u, sigma, vt = np.linalg.svd(omega)
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    # Products of all singular values but one, by prefix and suffix products: no division.
-    ones = np.ones((*sigma.shape[:-1], 1))
-    before = np.concatenate([ones, np.cumprod(sigma[..., :-1], axis=-1)], axis=-1)
-    after = np.concatenate([np.cumprod(sigma[..., :0:-1], axis=-1)[..., ::-1], ones], axis=-1)
-    determinant = sign * before[..., p - 1] * sigma[..., p - 1]
+    others = products_of_others(sigma)
+    determinant = sign * others[..., -1] * sigma[..., -1]
     columns = rhs if rhs.ndim == omega.ndim else rhs[..., None]
-    coordinates = (transpose(u) @ columns) * (before * after)[..., None]
+    coordinates = (transpose(u) @ columns) * others[..., None]
     action = (sign[..., None, None] * (transpose(vt) @ coordinates)).reshape(rhs.shape)
     largest = sigma[..., 0]
     reciprocal = np.divide(sigma[..., -1], largest, out=np.zeros_like(largest), where=largest > 0)

@@ -126,7 +126,7 @@ def _sample(
     state = problem.start
     for first, last in pairwise(cuts):
         left, right = mesh.edges[first], mesh.edges[last]
-        if first and float(left) in restarts:
+        if first:
             state = restarts[float(left)](state)
         if not np.isfinite(state).all():
             raise SolverError(

@@ -160,7 +160,7 @@ def _overlooked(
     looks = min(_LOOKS, _MOST_LOOKS // mesh.size)
     names = [name for name in MATRIX_NAMES if name not in system.coefficients.constant]
     found = np.zeros(mesh.size, dtype=bool)
-    if looks == 0 or not names:
+    if not looks:
         return found
     places = (np.arange(looks) + 0.5) / looks
     t = mesh.edges[:-1, None] + mesh.steps[:, None] * places
@@ -177,10 +177,10 @@ def _overlooked(
         size = np.maximum(np.abs(actual).max(axis=(0, 1)), np.abs(nodes).max(axis=(0, 1)))
         missed = np.abs(mesh.rule.interpolation(places) @ nodes - actual).max(axis=1)
         far = (missed > _SURPRISE * least * size).any(axis=0)
-        if far.any():  # each beside its own tail: rounding of one says nothing of another
-            tail = legendre_tail(nodes[..., far], mesh.rule, size[far])
-            least_of = np.maximum(tail, least * size[far])
-            found |= (missed[:, far] > _SURPRISE * least_of).any(axis=1)
+        # Each beside its own tail: rounding of one says nothing of another.
+        tail = legendre_tail(nodes[..., far], mesh.rule, size[far])
+        least_of = np.maximum(tail, least * size[far])
+        found |= (missed[:, far] > _SURPRISE * least_of).any(axis=1)
     return found
 
 

@@ -22,7 +22,6 @@ from gpebo_cli.numerics.mesh import (
     Kind,
     Mesh,
     Trajectory,
-    initial_mesh,
     legendre_tail,
     unresolved,
 )
@@ -191,15 +190,22 @@ def structure_of(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Structure:
     """The structure of a plant over a horizon, by elimination where that decides it."""
-    start, stop = time.start, time.start + time.horizon
     if system.n > SMALL:
         plant = _Plant(system, solver.max_strangeness_index + 1)
-        mesh = initial_mesh(start, stop, np.zeros(0), 1, radau_rule(solver.stages))
+        edges = np.array([time.start, time.start + time.horizon])
         with np.errstate(all="ignore"), suppress(UndecidedError):
-            plant.eliminate(mesh)
+            plant.eliminate(Mesh(edges, radau_rule(solver.stages)))
             return plant.structure()
+    return dense_structure(system, time, solver)
+
+
+def dense_structure(
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+) -> Structure:
+    """The structure of a plant over a horizon, by ranks of its derivative array."""
     return analyse(
-        system, start, stop, max_mu=solver.max_strangeness_index, rank_tol=solver.rank_tol
+        system, time.start, time.start + time.horizon, max_mu=solver.max_strangeness_index,
+        rank_tol=solver.rank_tol,
     )
 
 

@@ -25,11 +25,11 @@ from gpebo_cli.reduction.strangeness_free import (
     shown_rounding,
     strangeness_free_form,
 )
-from gpebo_cli.reduction.structure import Structure, analyse, growth_rates
+from gpebo_cli.reduction.structure import Structure, growth_rates
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import SHORT, few_elements, first_mesh, known_resolved, least_beside
-from gpebo_cli.simulation.large import SMALL, large_simulation
+from gpebo_cli.simulation.large import SMALL, dense_structure, large_simulation
 from gpebo_cli.simulation.linearised import Linearised, looked_along
 from gpebo_cli.simulation.newton import follow
 from gpebo_cli.simulation.signals import Signals, Simulation
@@ -69,7 +69,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     def solve_linear(
         linear: DescriptorSystem, window: TimeSettings, settings: SolverSettings, growth: float
     ) -> Trajectory | None:
-        structure = _structure(linear, window, settings)
+        structure = dense_structure(linear, window, settings)
         if structure.growth > growth:
             return None
         last[:] = [_solved(linear, window, settings, structure)]
@@ -107,14 +107,7 @@ def _simulate_linear(
     system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
-    return _solved(system, time, solver, _structure(system, time, solver))
-
-
-def _structure(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Structure:
-    return analyse(
-        system, time.start, time.start + time.horizon, max_mu=solver.max_strangeness_index,
-        rank_tol=solver.rank_tol,
-    )
+    return _solved(system, time, solver, dense_structure(system, time, solver))
 
 
 def _solved(
@@ -219,16 +212,16 @@ def _known_resolved(
     def evaluated(mesh: Mesh) -> Coefficients:
         return system.coefficients.taylor(mesh.points.ravel(), structure.mu, mesh.inside.ravel())
 
-    longest = SHORT / max(structure.rate, _TINY)
-    first = float(mesh.steps.max())
-    if solver.name != "ivp" and first > longest:
+    if solver.name == "ivp":
+        c = evaluated(mesh)
+        return mesh, c, _beside_inputs(c)
+    longest, first = SHORT / max(structure.rate, _TINY), float(mesh.steps.max())
+    if first > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
-    elif solver.name != "ivp" and structure.steady and bounded and 2.0 * first <= longest:
+    elif structure.steady and bounded and 2.0 * first <= longest:
         mesh = few_elements(system, mesh, cuts, longest)
     c = evaluated(mesh)
     terms = _beside_inputs(c)
-    if solver.name == "ivp":
-        return mesh, c, terms
     beside = terms(np.abs(system.initial_state))
     mesh, c = known_resolved(
         system, evaluated, lambda t: system.coefficients.taylor(t, 0), mesh, c, beside, solver,
@@ -269,7 +262,7 @@ def _growth_resolved(
                 f"{rates[worst]:.3g} 1/s near t = {mesh.edges[worst]:.6g}, which takes more than "
                 f"solver.max_elements = {most:.0f} elements; shorten time.horizon"
             )
-    return mesh.split(parts.astype(np.intp))[0] if parts.max() > 1.0 else mesh
+    return mesh.split(parts.astype(np.intp))[0]
 
 
 def _missed(
