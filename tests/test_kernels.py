@@ -478,6 +478,15 @@ def test_what_is_rounding_is_regularised_with_pivots():
 
 
 @needs_kernels
+def test_bounds_do_not_depend_on_the_units_of_all_equations():
+    E, A, *others = _bounds(np.random.default_rng(0), turned=True)
+    arguments = [("structure", "bounds", 8.0**k * E, 8.0**k * A, *others) for k in (0, 3)]
+    for one, other in zip(*(both_kinds_answer(*each) for each in arguments), strict=True):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-300)
+
+
+@needs_kernels
 def test_where_the_pivots_will_not_do_both_say_so():
     arguments = _eliminated(np.random.default_rng(0), growth=1e-3)
     assert both_kinds_answer("structure", "eliminated", *arguments) == (None, None)
