@@ -197,6 +197,17 @@ def test_jets_refuses_programs_that_lead_out_of_the_arrays():
         COMPILED.jets(t, t, none, *good[:4], None)
 
 
+def test_intervals_refuses_programs_that_lead_out_of_the_arrays():
+    t = np.zeros(3)
+    good = record([parse("t*sin(t)", {}, "f")]).program(1, apart=True)
+    assert COMPILED.intervals(t, t, t, *good) is not None
+    for place, index, value in [(0, (0, 0), 99), (0, (0, 1), 50), (2, 0, 50), (2, 0, -50)]:
+        other = [array.copy() for array in good]
+        other[place][index] = value
+        with pytest.raises(ValueError, match="will not do"):
+            COMPILED.intervals(t, t, t, *other)
+
+
 # --- the mesh ---
 
 
