@@ -260,9 +260,9 @@ def test_bounds_are_told_in_the_order_of_time():
     }
     bounds = {"h3": [-6.1e4, 7.2349e5], "h1": [-0.8876, 1.0]}
     found = run(
-        plant, observer={"name": "gpebo", "bounds": {"states": bounds}}, time={"horizon": HORIZON},
-        estimator={"name": "least_squares", "f0": 0.3},
-        noise={"name": "gaussian", "outputs": 0.05, "seed": 3},
+        plant, observer={"name": "gpebo", "bounds": {"states": bounds}},
+        time={"horizon": HORIZON, "samples": 21}, estimator={"name": "least_squares", "f0": 0.3},
+        noise={"name": "gaussian", "outputs": 0.05, "seed": 3, "sample_time": 0.2},
     )
     (held,) = found.details.estimation.active.values()
     times = [bound.time for bound in held]
