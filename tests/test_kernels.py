@@ -233,7 +233,7 @@ def _by_steps(E, A, B, F, C, rows, scale, domain, range_, kernel, equations):
     model = Equations(E, A, B, F, C, np.zeros((1, r, m)), np.zeros((1, r, q)), None)
     plant = SimpleNamespace(r=r, states=tuple("abcdefgh")[:n])
     o = matrices._by_steps(
-        plant, model, units, scale, np.zeros(1), 1e-10, None,
+        SimpleNamespace(system=plant, units=units), model, scale, np.zeros(1), 1e-10, None,
         Frame(domain, domain.T, range_, kernel, equations), lambda: E,
     )
     inner = range_.T @ (E / rows[:, None]) @ domain

@@ -76,6 +76,7 @@ class TextState:
     row: Array  # (rows, p + 1) [ψ | Y]
     scale: Array  # (p,) largest entry of each column of ψ so far
     growth: None = field(default=None, init=False)  # there is no Φ
+    log_norm: None = field(default=None, init=False)
     error_estimate: float = field(default=0.0, init=False)  # nothing is approximated but the hold
 
 
