@@ -217,6 +217,76 @@ def test_a_switch_at_given_instants():
     np.testing.assert_allclose(v[t > 3], 1 - np.exp(-2.0), atol=2e-6)
 
 
+@pytest.mark.parametrize(("words", "closed"), [
+    ("off=1,3 on=2", [True, False, True, False]), ("on=1,3 off=2", [False, True, False, True]),
+])
+def test_a_switch_is_closed_before_it_opens_first(words, closed):
+    plant = plant_of(f"switch\nS1 a 0 {words} ron=2 roff=5\nC1 a 0 1\n")
+    c = plant_from_mapping(plant).coefficients.taylor(np.array([0.5, 1.5, 2.5, 3.5]), 0)
+    np.testing.assert_allclose(c.A[0, :, 0, 0], np.where(closed, -1 / 2, -1 / 5), rtol=1e-15)
+
+
+def damped(t, since):
+    """SPICE's sine of an amplitude of 2 V and 0.4 Hz about 0.5 V, from 30 degrees on."""
+    wave = np.sin(0.8 * np.pi * (t - since).clip(0) + np.pi / 6)
+    return 0.5 + 2 * wave * np.exp(-0.2 * (t - since).clip(0))
+
+
+@pytest.mark.parametrize(("source", "expected"), [
+    ("SIN(0.5 2 0.4)", lambda t: 0.5 + 2 * np.sin(0.8 * np.pi * t)),
+    ("SIN(0.5 2 0.4 1 0.2 30)", lambda t: damped(t, 1)),
+    ("SIN(0.5 2 0.4 0 0.2 30)", lambda t: damped(t, 0)),
+    ("EXP(1 3 0.5 0.7 2 0.3)", lambda t: 1 + 2 * -np.expm1(-(t - 0.5).clip(0) / 0.7)
+     - 2 * -np.expm1(-(t - 2).clip(0) / 0.3)),
+    ("PWL(0.5 1 1 3 1 -1 2 4)", lambda t: np.interp(
+        t, [0.5, 1, np.nextafter(1, 2), 2], [1, 3, -1, 4])),
+    ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
+        t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
+    ("DC 2 AC 1", lambda t: 2 + 0 * t),
+])
+def test_sources_are_those_of_spice(source, expected):
+    plant = plant_of(f"source\nV1 a 0 {source}\nR1 a 0 1\n")
+    t = np.linspace(0.01, 4.99, 84)
+    u = plant_from_mapping(plant).coefficients.taylor(t, 0).u[0, :, 0]
+    np.testing.assert_allclose(u, expected(t), rtol=1e-12, atol=1e-12)
+
+
+def test_coupled_coils_are_three_that_are_not():
+    coils = "t\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nR2 b 0 3\n"
+    M = 0.5 * np.sqrt(2)
+    pair = simulated(plant_of(f"{coils}L1 a 0 1\nL2 b 0 2\nK1 L1 L2 0.5\n", measure="y=v(b)"))
+    tee = simulated(plant_of(
+        f"{coils}L1 a m {1 - M}\nL2 b m {2 - M}\nL3 m 0 {M}\n", measure="y=v(b)"
+    ))
+    np.testing.assert_allclose(pair["y"], tee["y"], atol=1e-9)
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("Va a 0 2\nE1 b 0 a 0 3", 6.0), ("Ra a c 1\nVa a 0 1\nVc c 0 3\nG1 b 0 a c 2", 4.0),
+    ("Ia 0 a 1\nVs a 0 0\nF1 0 b Vs 2", 2.0), ("Ia 0 a 1\nVs a 0 0\nH1 b 0 Vs 5", 5.0),
+])
+def test_what_is_controlled_follows_with_its_sign(text, value):
+    result = simulated(plant_of(f"t\n{text}\nRb b 0 1\n", measure="y=v(b)"), 1.0)
+    assert result["y"][-1] == pytest.approx(value, rel=1e-12)
+
+
+def test_a_circuit_starts_from_what_is_said_of_it():
+    """Voltages along chains of capacitors, and what currents follow from them."""
+    text = (
+        "t\nC1 a 0 1 ic=3\nC2 a b 1 ic=1\nR1 a b {2+time}\nL1 b c 1 ic=0.5\nL2 c 0 1\nR2 c 0 1\n"
+        "R3 0 a 2\n.ic i(L2)=0.25\n.save i(R1) i(R3)\n"
+    )
+    assert plant_of(text)["initial_state"] == {
+        "a": 3, "b": 2, "c": 0, "ir1": 0.5, "ir3": -1.5, "il1": 0.5, "il2": 0.25
+    }
+
+
+def test_comments_of_equations_stand_in_one_column():
+    for matrix in from_netlist(PAPER).to_yaml().split("\n\n")[1:]:
+        rows = [line for line in matrix.splitlines() if line.startswith("  - [")]
+        assert len({line.index("  # ") for line in rows}) <= 1, matrix
+
+
 def test_a_switched_capacitor():
     """C1 is charged, and then shares its charge with C2, again and again."""
     text = (

@@ -32,9 +32,9 @@ def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):
 
 
 def test_it_can_be_written_elsewhere(tmp_path):
-    said = printed(gpebo("new", "plant", "tank.yaml", "--config-dir", "my models", cwd=tmp_path))
-    assert (tmp_path / "my models" / "plant" / "tank.yaml").is_file()
-    assert "--config-dir 'my models' plant=tank" in said
+    said = printed(gpebo("new", "plant", "tank-2.yaml", "--config-dir", "my models", cwd=tmp_path))
+    assert (tmp_path / "my models" / "plant" / "tank-2.yaml").is_file()
+    assert "--config-dir 'my models' plant=tank-2" in said
 
 
 def test_an_observer_passes_its_test(tmp_path):

@@ -771,6 +771,7 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     assert any("no column was found for V" in doubt for doubt in found.doubts)
     for content, message in (
         (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
+        (b"t,V,y\n", "lab.csv has no rows below its header"),
         (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
     ):
         path.write_bytes(content)

@@ -18,7 +18,7 @@ from processes import assert_refused, refused
 from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.results import document
+from gpebo_cli.results import document, html
 from gpebo_cli.results.report import estimate_table
 
 FAST = ("time.samples=51", "time.horizon=8")
@@ -84,6 +84,13 @@ def page_of(*words: str) -> tuple[Page, str]:
     assert report.main([*words, "--output", "page.html"]) == 0
     text = Path("page.html").read_text(encoding="utf-8")
     return Page(text), text
+
+
+def test_rows_that_fail_are_marked_by_their_numbers_below_the_header():
+    written = html.table([["name"], ["a"], ["b"]], failed=[1])
+    assert [line for line in written.splitlines() if "class=fails" in line] == [
+        "<tr class=fails><td>b</td></tr>"
+    ]
 
 
 def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):

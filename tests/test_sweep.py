@@ -413,6 +413,20 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 
+@pytest.mark.parametrize(("values", "told"), [
+    ([[1, 2], [3, 1000]], ["1", "10", "1e+02", "1e+03"]),
+    ([[0, 2], [3, 90]], ["0", "30", "60", "90"]), ([[1, 2], [3, 4]], ["1", "2", "3", "4"]),
+])
+def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
+    import numpy as np
+
+    from gpebo_cli.results.comparison import _heat_map
+
+    x = np.array([1.0, 10.0])
+    figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "")
+    assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
+
+
 def test_error_curves_are_those_of_the_run(tmp_path):
     import numpy as np
     import pandas as pd
@@ -429,9 +443,11 @@ def test_error_curves_are_those_of_the_run(tmp_path):
     assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
     assert slow.parameter_size == slow.parameters[0]
     x = pd.read_csv(tmp_path / "a" / "signals.csv")[["x1", "x2", "x3"]]
-    hats = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")[[f"{i}_hat" for i in x]]
-    away = np.linalg.norm(hats.to_numpy() - x.to_numpy(), axis=1)
+    estimates = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")
+    away = np.linalg.norm(estimates[[f"{i}_hat" for i in x]].to_numpy() - x.to_numpy(), axis=1)
     np.testing.assert_allclose(slow.states, away)
+    away = estimates.to_numpy()[:, 2:6] - [1.5, -0.8, -1.0, 1.0]
+    np.testing.assert_allclose(slow.parameters, np.linalg.norm(away, axis=1), rtol=1e-9)
     # The metric is of scaled states, the curves are not: their ratio is that of sizes of states.
     for case, curves in zip(cases, (slow, fast), strict=True):
         rms = np.sqrt(trapezoid(curves.states**2, curves.t) / 20.0)
