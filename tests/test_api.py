@@ -258,6 +258,10 @@ def test_a_folder_of_ones_own(tmp_path):
     assert "mine" in available("plant", tmp_path)
     with pytest.raises(ConfigError, match="there is no such folder"):
         available("plant", tmp_path / "missing")
+    with refused("available('plants'): no such group", "did you mean plant?"):
+        available("plants")
+    with refused("regression takes a name, a path or a mapping"):
+        run(regression=load_plant("circuit"))
     result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")

@@ -14,16 +14,16 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 from plants import DECAYING
-from processes import assert_refused, begin, printed, rows_of, wait_for
+from processes import assert_refused, begin, printed, refused, rows_of, wait_for
 from processes import process as gpebo
 from scipy.integrate import trapezoid
 
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
-from gpebo_cli.cli.sweep import _launch, _overrides
+from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failures
 from gpebo_cli.cli.sweep_progress import Watch
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.sweep_folder import JobRecord, Plan, read_plan, read_record, write_record
 
@@ -300,6 +300,32 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     assert re.search(r"0 +1e6 +done +0\.5 +5\.25", said)
     assert re.search(r"1 +1e\+08 +failed +0\.5", said)
     assert "plant" not in said, "what is the same for all is left out"
+    assert not Watch(tmp_path, Plan(jobs, "x"), [0], quiet=True)._terminal
+
+
+def test_of_a_long_table_and_of_many_failures_the_first_ones_are_told(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    records = [
+        JobRecord(k, {"a": str(k)}, "failed" if k < 7 else "done", 0.5, "why" * (k < 7))
+        for k in range(25)
+    ]
+    for count, more in ((25, ["… 5 more"]), (21, ["… 1 more"]), (20, [])):
+        _print_table(records[:count], tmp_path / "s", rows=True)
+        head, *body = capsys.readouterr().out.splitlines()
+        assert head.split()[:2] == ["job", "a"]
+        assert [line.split()[0] for line in body[:20]] == [str(k) for k in range(20)]
+        ends = ["s/results.csv", f"{count} jobs, {count - 7} done, 7 failed"]
+        assert body[20:] == [*more, *ends]
+    failures = "; ".join(f"job {k}: why" for k in range(5))
+    for count, more in ((7, "; and 2 more in results.csv"), (5, "")):
+        with pytest.raises(GpeboError) as caught:
+            _raise_failures([*records[:count], records[-1]], tmp_path / "s", "", stopped=False)
+        assert str(caught.value) == f"{count} of {count + 1} jobs failed: {failures}{more}"
+    with refused("the launcher gave up: it died", by=GpeboError):
+        _raise_failures(records[7:], tmp_path / "s", "it died", stopped=False)
+    _raise_failures(records[7:], tmp_path / "s", "", stopped=False)
 
 
 def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monkeypatch):
@@ -411,6 +437,25 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     legends = [panel.legend for panel in metric_panels(two, "gamma")]
     assert legends == [True, *[False] * (len(METRICS) - 1)]
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
+
+
+def test_a_map_has_each_case_in_its_place():
+    import numpy as np
+
+    from gpebo_cli.results.comparison import heat_grid
+    from gpebo_cli.results.finished import Case
+
+    def cases(*places):
+        return [Case("r", Path("r"), 0, {}, {"a": a, "b": b}, {"rms": 10 * a + b})
+                for a, b in places]
+
+    x, y, values = heat_grid(cases((2, 5), (1, 4), (2, 4)), "a", "b", "rms")
+    assert (x.tolist(), y.tolist()) == ([1, 2], [4, 5])
+    np.testing.assert_array_equal(values, [[14, 24], [np.nan, 25]])
+    assert heat_grid(cases((1, 4), (1, 5)), "a", "b", "rms") is None  # one column
+    assert heat_grid(cases((1, 4), (2, 5)), "a", "b", "rms") is not None
+    assert heat_grid(cases((1, 4), (2, 5), (3, 6), (4, 7)), "a", "b", "rms") is None
+    assert heat_grid(cases((1, 4), (2, 5)), "a", "b", "other") is None
 
 
 @pytest.mark.parametrize(("values", "told"), [
