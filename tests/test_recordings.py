@@ -295,6 +295,19 @@ def test_rows_are_the_same_however_a_stream_is_cut(size):
     assert rows == [[0.0, 1.0, 2.0], [0.5, 1.0, 3.0], [1.0, 2.0, 3.0]]
 
 
+@pytest.mark.parametrize("last", [False, True])
+def test_a_line_without_an_end_is_refused_by_its_number(last):
+    """With the rows before it, whatever pieces they come in."""
+    reader = LineReader("S", DataSettings("csv"), shipped("circuit"))
+    content = b"t,V,y\n0,1,2\n" + b"1" * ((1 << 20) + 1)
+    assert reader.feed(content[:-1]) == ([[0.0, 1.0, 2.0]], "")
+    assert reader.feed(b"1", last=last) == ([], "S, line 3: longer than 1048576 bytes")
+    again = LineReader("S", DataSettings("csv"), shipped("circuit"))
+    assert again.feed(content, last=last) == (
+        [[0.0, 1.0, 2.0]], "S, line 3: longer than 1048576 bytes"
+    )
+
+
 CELLS = st.sampled_from([
     "0", "1", "2.5", "-1e3", ".5", "5.", " 7 ", "\t8", "+9", "1e400", "nan", "inf", "", "１", "1_0",
     "0x1", "True", "\u00a01", "\v2", "3\f", "4\r", "5\0", "1e", '"6"', '"7', "1 2", "\u20289",
