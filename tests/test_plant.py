@@ -373,6 +373,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mine(unknowns={"a": None}, F=[[0], [0]]), "unknowns.a is empty; write its true"
     ),
     "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty; write a number or"),
+    "entry is infinite": (
+        lambda: mine(E=[[1, float("inf")], [0, 0]]), "E[0][1] is inf; write a finite number"),
     "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list; write a number"),
     "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),
     "no initial state": (lambda: without("initial_state"), "initial_state is missing"),
