@@ -704,6 +704,13 @@ def test_from_a_file_on_the_command_line(tmp_path):
     assert not (tmp_path / "plant" / "other.yaml").exists()
 
 
+def test_a_plant_that_cannot_be_simulated_is_written_all_the_same(tmp_path):
+    np.savez(tmp_path / "m.npz", E=np.zeros((1, 1)), A=np.zeros((1, 1)), C=np.eye(1))
+    said = printed(gpebo("new", "plant", "mine", "--from", "m.npz", cwd=tmp_path))
+    assert "it is written, but cannot be simulated yet: " in said
+    assert (tmp_path / "plant" / "mine.yaml").is_file()
+
+
 def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatch):
     """The same numbers as in text; what varies stays there; a run is repeated from its folder."""
     monkeypatch.chdir(tmp_path)

@@ -105,6 +105,8 @@ def test_every_key_is_explained():
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),
+        (["estimator", "a", "--from", "a.cir"], "gpebo new estimator has a template of its own"),
+        (["plant", "a", "--plant", "b"], "other kinds have no --plant"),
         (["estimator", "a-b"], "a-b cannot be the name of a Python module"),
         (["estimator", "random"], "random cannot be the name of a Python module"),
     ],

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from examples import gpebo
-from factories import make_result
+from factories import make_result, with_figures
 from processes import assert_refused, refused
 
 from gpebo_cli import run
@@ -23,6 +23,7 @@ from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.results import document, html
+from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.report import case_table, estimate_table, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
@@ -71,6 +72,19 @@ def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
     assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])
     assert len(told) == shown
+
+
+@pytest.mark.parametrize("count", [40, 41, 45])
+def test_of_many_cases_a_comparison_prints_the_best(tmp_path, capsys, count):
+    gains = tuple(1e8 * (k + 1) for k in range(count))
+    write_run(with_figures(make_result(gammas=gains, samples=5), False), tmp_path / "run", "")
+    assert compare.main([str(tmp_path / "run"), "--no-figures"]) == 0
+    _, *rows = capsys.readouterr().out.splitlines()
+    column = [float(row.split()[2]) for row in rows[:40]]
+    assert column == sorted(gains, reverse=True)[:40]  # larger ones are faster
+    assert rows[40:] == ([f"… {count - 40} more; --csv FILE has all"] if count > 40 else [])
+    assert compare.main([str(tmp_path / "run"), "--no-figures", "--sort", "plant"]) == 0
+    assert capsys.readouterr().out.split()[:2] == ["run", "plant"]  # though it is the same for all
 
 
 def test_errors_over_seeds_are_told_by_case_and_parameter(tmp_path):
@@ -230,7 +244,9 @@ def test_titles_from_strangers_are_text(inside, tmp_path):
     assert " ".join(page.text).count(bad) == 2
 
 
-@pytest.mark.parametrize("words", [["nowhere"], ["--ouput=x", "circuit"], [], ["."]])
+@pytest.mark.parametrize("words", [
+    ["nowhere"], ["--ouput=x", "circuit"], [], ["."], ["circuit", "--output", "sweep"],
+])
 def test_wrong_words_of_report(inside, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path if words == ["."] else inside)
     with pytest.raises(ConfigError):

@@ -439,6 +439,23 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 
+def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():
+    from gpebo_cli.results.comparison import _labels
+    from gpebo_cli.results.finished import Case
+
+    def labels(*of):
+        cases = [Case(run, Path(run), 0, {"estimator": name}, {"gamma": gain}, {})
+                 for run, name, gain in of]
+        return _labels(cases, cases[1:])
+
+    assert labels(("a", "drem", 1.0), ("a", "drem", 10.0)) == ["γ = 10"]
+    assert labels(("a", "drem", 1.0), ("a", "mre", 10.0)) == ["mre, γ = 10"]
+    assert labels(("a", "drem", 1.0), ("b", "drem", 1.0)) == ["b"]
+    both = (("a", "drem", 1.0), ("b", "drem", 1.0), ("b", "drem", 10.0))
+    assert labels(*both) == ["b, γ = 1", "b, γ = 10"]
+    assert labels(*both[:2], ("c", "drem", 10.0)) == ["b", "c"]
+
+
 def test_a_map_has_each_case_in_its_place():
     import numpy as np
 
