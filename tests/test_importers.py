@@ -291,6 +291,17 @@ def test_a_circuit_starts_from_what_is_said_of_it():
     }
 
 
+def test_outputs_have_names_units_and_rows():
+    plant = plant_of(
+        "t\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n",
+        measure="v(a),v(a,b),s=i(R1)-2*i(V1),v(a)+i(R1),-3*v(b)",
+    )
+    assert plant["states"] == ["a", "b", "ir1", "iv1"]
+    assert plant["outputs"] == ["y_a", "y_a_", "s", "y", "y_b"]
+    assert [plant["units"].get(name) for name in plant["outputs"]] == ["V", "V", "A", None, "V"]
+    assert plant["C"] == [[1, 0, 0, 0], [1, -1, 0, 0], [0, 0, 1, -2], [1, 0, 1, 0], [0, -3, 0, 0]]
+
+
 def test_comments_of_equations_stand_in_one_column():
     for matrix in from_netlist(PAPER).to_yaml().split("\n\n")[1:]:
         rows = [line for line in matrix.splitlines() if line.startswith("  - [")]
