@@ -22,7 +22,7 @@ from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failures
-from gpebo_cli.cli.sweep_progress import Watch
+from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.sweep_folder import JobRecord, Plan, read_plan, read_record, write_record
@@ -301,6 +301,14 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     assert re.search(r"1 +1e\+08 +failed +0\.5", said)
     assert "plant" not in said, "what is the same for all is left out"
     assert not Watch(tmp_path, Plan(jobs, "x"), [0], quiet=True)._terminal
+
+
+@pytest.mark.parametrize(("cell", "shown"), [
+    ("drem", "drem"), ("", ""), ("100000", "100000"), ("1000000", "1e+06"), ("0.123456", "0.1235"),
+    ("sin(2.5*t)", "sin(2.5*t)"), ("1e8", "1e8"), ("100000000.0", "1e+08"),
+])
+def test_long_numbers_are_shown_with_four_digits(cell, shown):
+    assert told(cell) == shown
 
 
 def test_of_a_long_table_and_of_many_failures_the_first_ones_are_told(
