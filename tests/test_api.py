@@ -15,7 +15,7 @@ import pytest
 import yaml
 from examples import ROOT, assert_repeats, gpebo
 from omegaconf import OmegaConf
-from plants import DECAYING
+from plants import DECAYING, one_state
 from processes import assert_refused, install, printed, process, python, refused
 
 import gpebo_cli
@@ -83,6 +83,11 @@ def test_estimates_have_one_row_per_case_and_errors_are_estimate_minus_truth(cir
     truth = circuit.parameters["e0_il"]
     np.testing.assert_allclose(circuit.errors["e0_il"], circuit.estimates["e0_il"] - truth)
     assert np.abs(circuit.errors["il"][:, -1]).max() < 1e-9
+
+
+def test_parameters_are_those_at_the_end():
+    plant = one_state(unknowns={"k": "1 + t"}, F=[[1]])
+    assert run(plant, time={"horizon": 2, "samples": 11}).parameters["k"] == 3.0
 
 
 def test_a_name_that_is_not_there_is_a_key_error_with_the_nearest_one(circuit):
@@ -258,6 +263,10 @@ def test_a_folder_of_ones_own(tmp_path):
     assert "mine" in available("plant", tmp_path)
     with pytest.raises(ConfigError, match="there is no such folder"):
         available("plant", tmp_path / "missing")
+    with refused("available('plants'): no such group", "did you mean plant?"):
+        available("plants")
+    with refused("regression takes a name, a path or a mapping"):
+        run(regression=load_plant("circuit"))
     result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")

@@ -73,6 +73,22 @@ def test_both_paths_bound_alike(line, order):
         np.testing.assert_allclose(a[some], b[some], rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("text", [
+    "t**2", "t*t", "t**4", "abs(t)", "cosh(t)", "sinh(t)", "(t + 4)**-1", "1/(t + 4)",
+    "(t + 4)**-2", "(t + 4)**1.5", "sqrt(t + 4)", "(t + 4)**-0.5", "log(t + 4)", "exp(t)", "erf(t)",
+    "sin(t)", "cos(t)", "sin(2*t)", "tan(t/3)", "tanh(t)", "atan(t)", "asin(t/4)", "acos(t/4)",
+    "asinh(t)", "acosh(t + 5)", "atanh(t/4)", "max(t, -2)", "min(t, -2)", "sign(t)", "step(t + 2)",
+])
+def test_bounds_of_one_function_are_what_it_reaches(text):
+    low, high = np.array([-3.0, -2.5, 0.25]), np.array([1.0, -0.5, 1.0])
+    tape = record([parse(text, {}, "here")])
+    t = np.linspace(low, high, 4001)
+    reached = tape.taylor(t.ravel(), 0)[0, :, 0].reshape(t.shape)
+    for least, most in by_both(lambda: Bounds(tape).of(low, high, 0)):
+        np.testing.assert_allclose(least[0, :, 0], reached.min(axis=0), atol=1e-5)
+        np.testing.assert_allclose(most[0, :, 0], reached.max(axis=0), atol=1e-5)
+
+
 def test_bounds_are_not_much_wider_than_they_must_be():
     edges = np.linspace(0, 20, 4001)
     tape = record([parse("4*cos(2*t)*sin(t/5) + exp(-t)/(2 + t)", {}, "here")])

@@ -89,7 +89,8 @@ def test_figures_list_topics_recipes_and_columns():
     assert names("compare", "--sort", "rms") == ["rms_error_states"]
     assert names("new", "p") == ["plant"]
     assert names("completion", "") == [*SHELLS, "--help"]
-    assert names("run", "--cfg", "j") == ["job"]
+    assert names("run", "--cfg", "j") == names("run", "-m", "--cfg", "j") == ["job"]
+    assert names("run", "hydra.") == ["hydra.run.dir=", "hydra.sweep.dir="]
 
 
 def test_folders(here):
@@ -97,6 +98,7 @@ def test_folders(here):
     (here / "plant" / ".hidden").mkdir()
     assert names("run", "--config-dir", "pl") == ["plant/"]
     assert names("run", "--config-dir=pl") == ["--config-dir=plant/"]
+    assert names("run", "plant=mine", "--config-dir", "pl") == ["plant/"]
     assert names("run", "resume=plant/") == ["resume=plant/inner/"]
     assert names("run", "resume=plant/.") == ["resume=plant/.hidden/"]
     assert names("compare", "~/pl") == ["~/plant/"]

@@ -191,6 +191,8 @@ def test_axes_carry_the_units_of_their_signals() -> None:
     figures = dict(draw(make_result(samples=51)))
     labels = {name: [axes.get_ylabel() for axes in fig.axes] for name, fig in figures.items()}
     assert labels["states"] == ["states (V)", "states (A)"]
+    [(_, one_curve_each)] = draw(make_result(samples=51), ["signals"])
+    assert {axes.get_legend() for axes in one_curve_each.axes} == {None}
     assert labels["estimates_a"] == ["$e_{1}$ (V)", "$e_{2}$ (V)", "$i_L$ (A)"]
     assert labels["estimates_b"] == [
         r"$\mathrm{ir}_{1}$ (A)", r"$\mathrm{ir}_{2}$ (A)", r"$\mathrm{iv}$ (A)"

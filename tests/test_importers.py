@@ -7,6 +7,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import zipfile
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -217,6 +218,96 @@ def test_a_switch_at_given_instants():
     np.testing.assert_allclose(v[t > 3], 1 - np.exp(-2.0), atol=2e-6)
 
 
+@pytest.mark.parametrize(("words", "closed"), [
+    ("off=1,3 on=2", [True, False, True, False]), ("on=1,3 off=2", [False, True, False, True]),
+])
+def test_a_switch_is_closed_before_it_opens_first(words, closed):
+    plant = plant_of(f"switch\nS1 a 0 {words} ron=2 roff=5\nC1 a 0 1\n")
+    c = plant_from_mapping(plant).coefficients.taylor(np.array([0.5, 1.5, 2.5, 3.5]), 0)
+    np.testing.assert_allclose(c.A[0, :, 0, 0], np.where(closed, -1 / 2, -1 / 5), rtol=1e-15)
+
+
+def damped(t, since):
+    """SPICE's sine of an amplitude of 2 V and 0.4 Hz about 0.5 V, from 30 degrees on."""
+    wave = np.sin(0.8 * np.pi * (t - since).clip(0) + np.pi / 6)
+    return 0.5 + 2 * wave * np.exp(-0.2 * (t - since).clip(0))
+
+
+@pytest.mark.parametrize(("source", "expected"), [
+    ("SIN(0.5 2 0.4)", lambda t: 0.5 + 2 * np.sin(0.8 * np.pi * t)),
+    ("SIN(0.5 2 0.4 1 0.2 30)", lambda t: damped(t, 1)),
+    ("SIN(0.5 2 0.4 0 0.2 30)", lambda t: damped(t, 0)),
+    ("EXP(1 3 0.5 0.7 2 0.3)", lambda t: 1 + 2 * -np.expm1(-(t - 0.5).clip(0) / 0.7)
+     - 2 * -np.expm1(-(t - 2).clip(0) / 0.3)),
+    ("PWL(0.5 1 1 3 1 -1 2 4)", lambda t: np.interp(
+        t, [0.5, 1, np.nextafter(1, 2), 2], [1, 3, -1, 4])),
+    ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
+        t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
+    ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
+])
+def test_sources_are_those_of_spice(source, expected):
+    plant = plant_of(f"source\nV1 a 0 {source}\nR1 a 0 1\n")
+    t = np.linspace(0.01, 4.99, 84)
+    u = plant_from_mapping(plant).coefficients.taylor(t, 0).u[0, :, 0]
+    np.testing.assert_allclose(u, expected(t), rtol=1e-12, atol=1e-12)
+
+
+def test_coupled_coils_are_three_that_are_not():
+    coils = "t\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nR2 b 0 3\n"
+    M = 0.5 * np.sqrt(2)
+    pair = simulated(plant_of(f"{coils}L1 a 0 1\nL2 b 0 2\nK1 L1 L2 0.5\n", measure="y=v(b)"))
+    tee = simulated(plant_of(
+        f"{coils}L1 a m {1 - M}\nL2 b m {2 - M}\nL3 m 0 {M}\n", measure="y=v(b)"
+    ))
+    np.testing.assert_allclose(pair["y"], tee["y"], atol=1e-9)
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("Va a 0 2\nE1 b 0 a 0 3", 6.0), ("Ra a c 1\nVa a 0 1\nVc c 0 3\nG1 b 0 a c 2", 4.0),
+    ("Ia 0 a 1\nVs a 0 0\nF1 0 b Vs 2", 2.0), ("Ia 0 a 1\nVs a 0 0\nH1 b 0 Vs 5", 5.0),
+    ("Ib 0 b 1\nE1 b c b 0 3\nRc c 0 1", -1.0),  # v_c = -2 v_b
+])
+def test_what_is_controlled_follows_with_its_sign(text, value):
+    result = simulated(plant_of(f"t\n{text}\nRb b 0 1\n", measure="y=v(b)"), 1.0)
+    assert result["y"][-1] == pytest.approx(value, rel=1e-12)
+
+
+def test_subcircuits_are_what_stands_in_them():
+    inside, outside = (simulated(plant_of(text, measure=["y=v(o)"]), 3.0) for text in (
+        NETLISTS["subcircuits"][0].replace("{r*rr}", "'r*rr'"),
+        "flat\nV1 in 0 SIN(0 1 0.3)\nR1 in m 1\nC1 m 0 1 ic=0.4\nR2 m o 2\nC2 o 0 0.3 ic=0.4\n",
+    ))
+    np.testing.assert_allclose(inside["y"], outside["y"], atol=1e-11)
+
+
+def test_a_circuit_starts_from_what_is_said_of_it():
+    """Voltages along chains of capacitors, and what currents follow from them."""
+    text = (
+        "t\nC1 a 0 1 ic=3\nC2 a b 1 ic=1\nR1 a b {2+time}\nL1 b c 1 ic=0.5\nL2 c 0 1\nR2 c 0 1\n"
+        "R3 0 a 2\n.ic i(L2)=0.25\n.save i(R1) i(R3)\n"
+    )
+    assert plant_of(text)["initial_state"] == {
+        "a": 3, "b": 2, "c": 0, "ir1": 0.5, "ir3": -1.5, "il1": 0.5, "il2": 0.25
+    }
+
+
+def test_outputs_have_names_units_and_rows():
+    plant = plant_of(
+        "t\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n",
+        measure="v(a),v(a,b),s=i(R1)-2*i(V1),v(a)+i(R1),-3*v(b)",
+    )
+    assert plant["states"] == ["a", "b", "ir1", "iv1"]
+    assert plant["outputs"] == ["y_a", "y_a_", "s", "y", "y_b"]
+    assert [plant["units"].get(name) for name in plant["outputs"]] == ["V", "V", "A", None, "V"]
+    assert plant["C"] == [[1, 0, 0, 0], [1, -1, 0, 0], [0, 0, 1, -2], [1, 0, 1, 0], [0, -3, 0, 0]]
+
+
+def test_comments_of_equations_stand_in_one_column():
+    for matrix in from_netlist(PAPER).to_yaml().split("\n\n")[1:]:
+        rows = [line for line in matrix.splitlines() if line.startswith("  - [")]
+        assert len({line.index("  # ") for line in rows}) <= 1, matrix
+
+
 def test_a_switched_capacitor():
     """C1 is charged, and then shares its charge with C2, again and again."""
     text = (
@@ -307,6 +398,10 @@ def test_what_continues_and_what_is_a_comment():
     ("V1 a 0 PULSE(0 1 0 1n 1n 1u 2u 2000)", "at most 1000 are read"),
     ("R1 out 0 1\n.ic v(aut)=1", ".ic v(aut) is neither the voltage of a node"),
     ("R1 a 0 1\nC1 a 0 1\n.ic i(C1)=1", ".ic i(c1) is neither"),
+    ("+ R1 a 0 1", "line 2: there is no line that + continues"),
+    ("R1 a 0 1\n.ic v(a)=x", "line 3: .ic v(a) = 'x' is not a number"),
+    ("C1 a 0 1 ic=x", "C1: ic=x is not a number"), ("R-1 a 0 1", "'R-1' cannot be a name; use"),
+    ("R1 a 0 1\nF1 a 0 R1 2", "line 3: F1 is controlled by the current of r1, which has to be"),
     ("V1 a 0 1 2", "is no source"), ("R1 a 0 1\n" * 20001, "lines; at most"),
     ("\n".join(f"R{k} a 0 1" for k in range(5001)), "more than 5000 elements"),
 ])
@@ -351,6 +446,13 @@ def test_mechanics_of_index_3():
     acceleration = np.array(slope(t, z)[1])
     rod = 2 * acceleration + 0.3 * z[1] + 4 * z[0] - np.sin(t)
     np.testing.assert_allclose(result["lambda1"], rod, atol=1e-8)
+
+
+def test_a_position_that_is_prescribed_needs_a_force():
+    model = {"M": [[2]], "G": [[1]], "r": ["sin(t)"], "inputs": {"u": 3}, "B": [[1]]}
+    result = simulated(from_mechanics(model, "driven").mapping(), 3.0)
+    np.testing.assert_allclose(result["q1"], np.sin(result["t"]), atol=1e-10)
+    np.testing.assert_allclose(result["lambda1"], -2 * np.sin(result["t"]) - 3, atol=1e-8)
 
 
 def slider_crank():
@@ -588,6 +690,17 @@ def test_text_of_a_linear_model_with_mistakes(matrix, message, tmp_path):
         from_file(tmp_path / "m.py", "p")
 
 
+def test_files_that_are_no_models(tmp_path):
+    for name, text, message in (
+        ("m.txt", "", "m.txt: expected a .mat, .npz, .py, .m or .jl file, or a folder of .mtx"),
+        ("m.py", "B = [[1]]\n", r"m.py has no line A = \[...\]"),
+        ("m.m", "A = [1];\nx0 = [a];\n", "m.m: x0: 'a' is not a number"),
+    ):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            from_file(tmp_path / name, "p")
+
+
 def test_from_a_file_on_the_command_line(tmp_path):
     (tmp_path / "paper.cir").write_text(PAPER)
     words = ("new", "plant", "mine", "--from", "paper.cir", "--measure", "y=i(L)+i(V)")
@@ -600,6 +713,13 @@ def test_from_a_file_on_the_command_line(tmp_path):
     done = gpebo(*words[:2], "other", "--from", "nothing.cir", cwd=tmp_path)
     assert_refused(done, "error: nothing.cir cannot be read: No such file or directory\n")
     assert not (tmp_path / "plant" / "other.yaml").exists()
+
+
+def test_a_plant_that_cannot_be_simulated_is_written_all_the_same(tmp_path):
+    np.savez(tmp_path / "m.npz", E=np.zeros((1, 1)), A=np.zeros((1, 1)), C=np.eye(1))
+    said = printed(gpebo("new", "plant", "mine", "--from", "m.npz", cwd=tmp_path))
+    assert "it is written, but cannot be simulated yet: " in said
+    assert (tmp_path / "plant" / "mine.yaml").is_file()
 
 
 def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatch):
@@ -634,6 +754,8 @@ def test_a_large_plant_has_its_matrices_in_a_file_beside_it(tmp_path, monkeypatc
     ({"A": np.full((2, 2), np.nan)}, "A[0][0]"),
     ({"A": np.zeros((5001, 5000))}, "unpacks to more than"),
     (b"PK\x03\x04 no archive", "is no archive of matrices"),
+    ((2, 0), "A is an array of version (2, 0); expected version (1, 0)"),
+    ("long", "m.npz has more than 20000000 bytes"),
     (None, "cannot be read"), ("link", "lies outside of"), ("pipe", "is not a regular file"),
 ])
 def test_mistakes_in_archives(content, message, tmp_path):
@@ -644,6 +766,12 @@ def test_mistakes_in_archives(content, message, tmp_path):
         np.savez_compressed(path, **content)
     elif isinstance(content, bytes):
         path.write_bytes(content)
+    elif isinstance(content, tuple):
+        with zipfile.ZipFile(path, "w") as archive, archive.open("A.npy", "w") as stream:
+            np.lib.format.write_array(stream, np.eye(2), content)
+    elif content == "long":
+        with path.open("wb") as stream:
+            stream.truncate(20_000_001)
     elif content == "link":
         np.savez(tmp_path / "other.npz", A=np.eye(2))
         path.symlink_to(tmp_path / "other.npz")

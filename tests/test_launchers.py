@@ -175,6 +175,19 @@ def test_a_child_that_is_collected_is_not():
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
+def test_a_child_may_be_collected_late(monkeypatch):
+    monkeypatch.setattr(gpebo_cli.cli.workers, "_INTERVAL", 0.02)
+    monkeypatch.setattr(gpebo_cli.cli.workers, "end_children", lambda: None)
+
+    def launch():
+        child = subprocess.Popen(["true"])
+        time.sleep(0.2)
+        return child.wait()
+
+    assert apart(launch, patience=10.0) == 0
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs /proc")
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
 def test_workers_end_with_their_parent(tmp_path, how):
     if reason := why_not("joblib"):

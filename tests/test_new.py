@@ -32,9 +32,9 @@ def test_it_runs_as_it_stands_with_the_defaults_and_converges(tmp_path):
 
 
 def test_it_can_be_written_elsewhere(tmp_path):
-    said = printed(gpebo("new", "plant", "tank.yaml", "--config-dir", "my models", cwd=tmp_path))
-    assert (tmp_path / "my models" / "plant" / "tank.yaml").is_file()
-    assert "--config-dir 'my models' plant=tank" in said
+    said = printed(gpebo("new", "plant", "tank-2.yaml", "--config-dir", "my models", cwd=tmp_path))
+    assert (tmp_path / "my models" / "plant" / "tank-2.yaml").is_file()
+    assert "--config-dir 'my models' plant=tank-2" in said
 
 
 def test_an_observer_passes_its_test(tmp_path):
@@ -105,6 +105,8 @@ def test_every_key_is_explained():
         (["plant", "a", "--confg-dir", "b"], "did you mean --config-dir?"),
         (["plant", "a", "--config-dir"], "--config-dir needs a folder"),
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),
+        (["estimator", "a", "--from", "a.cir"], "gpebo new estimator has a template of its own"),
+        (["plant", "a", "--plant", "b"], "other kinds have no --plant"),
         (["estimator", "a-b"], "a-b cannot be the name of a Python module"),
         (["estimator", "random"], "random cannot be the name of a Python module"),
     ],

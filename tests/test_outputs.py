@@ -231,6 +231,28 @@ def test_summary_has_the_evidence(tmp_path: Path) -> None:
     assert summary["verdict"].startswith("done")
 
 
+def test_summary_has_the_last_estimates_and_truths_of_each_case(tmp_path: Path) -> None:
+    result = make_result(samples=50, thin=10)
+    assert result.estimation is not None
+    spread = np.arange(60.0).reshape(2, 5, 6)
+    estimation = replace(
+        result.estimation, states_std=spread, parameters_std=spread[..., :3],
+        true_parameters=spread[1, :, 3:],
+    )
+    folder = write(replace(result, estimation=estimation), tmp_path)
+    header, table = read_table(folder / "estimates.csv")
+    names, signals = read_table(folder / "signals.csv")
+    parameters = dict(zip(result.estimation.names, spread[1, -1, 3:], strict=True))
+    assert read_summary(folder)["parameters"] == parameters
+    truth = dict(zip(names, signals[-1], strict=True)) | parameters
+    for case, told in read_summary(folder)["estimates"].items():
+        last = dict(zip(header, table[table[:, 0] == int(case)][-1], strict=True))
+        for name, one in told.items():
+            found = [one["value"], one["std"], one["true"]]
+            assert found == [last[f"{name}_hat"], last[f"{name}_std"], truth[name]]
+        assert list(told) == ["e0_e1", "e0_e2", "e0_il", *STATES]
+
+
 def test_summary_gives_ranges_for_many_cases(tmp_path: Path) -> None:
     gammas = (1e6, *np.logspace(8, 12, 100))
     summary = read_summary(write(make_result(gammas=gammas, samples=11), tmp_path))

@@ -242,6 +242,19 @@ def test_no_curve_over_gains(cases: list[Mapping[str, float]]) -> None:
     assert ("error_norms" in dict(describe(result))) == (len(cases) > 2)
 
 
+@pytest.mark.parametrize("unknown", [[], ["parameters"], ["states"], ["parameters", "states"]])
+def test_errors_are_drawn_over_gains_where_any_truth_is_known(unknown: list[str]) -> None:
+    result = make_result(gammas=(1e6, 1e8, 1e10), samples=21)
+    assert result.metrics is not None
+    if "parameters" in unknown:
+        nobody = replace(result.metrics, final_error_parameters=np.full(3, np.nan))
+        result = replace(result, metrics=nobody)
+    if "states" in unknown:
+        lost = replace(result.simulation, states=np.nan * result.simulation.states)
+        result = replace(result, simulation=lost)
+    assert bool(gains_of(result)) == (len(unknown) < 2)
+
+
 def test_an_axis_of_less_than_two_decades_names_its_ends() -> None:
     curve = Curve(np.array([2.0, 3.0, 5.0]), np.ones(3), "", line(0))
     axes = compose([Panel("y", (curve,), axis=Axis("g", "gain", log=True))]).axes[0]

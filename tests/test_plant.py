@@ -16,7 +16,7 @@ from processes import refused
 from gpebo_cli import run
 from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource
+from gpebo_cli.model.descriptor import MATRIX_NAMES, CoefficientSource, check_sizes
 from gpebo_cli.model.plant import KEYS, plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -373,6 +373,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: mine(unknowns={"a": None}, F=[[0], [0]]), "unknowns.a is empty; write its true"
     ),
     "entry is empty": (lambda: mine(E=[[1, None], [0, 0]]), "E[0][1] is empty; write a number or"),
+    "entry is infinite": (
+        lambda: mine(E=[[1, float("inf")], [0, 0]]), "E[0][1] is inf; write a finite number"),
     "entry is a list": (lambda: mine(E=[[1, [0]], [0, 0]]), "E[0][1] is a list; write a number"),
     "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),
     "no initial state": (lambda: without("initial_state"), "initial_state is missing"),
@@ -444,6 +446,19 @@ def test_entries_beyond_all_numbers_are_an_error_and_no_endless_decomposition() 
     system = plant_from_mapping(mine(E=[["exp(20*t)", 0], [0, 1]]))
     with pytest.raises(ConfigError, match=r"E\[0\]\[0\] is .*at t = 7\.5; numbers go up to 1e\+50"):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings())
+
+
+@pytest.mark.parametrize(("changes", "says"), [
+    ({"E": [["-1e-60*(1 + t)", 0], [0, 1]]},
+     "E[0][0] is -1e-60 at t = 0; numbers of E go down to 1e-50, quotients by smaller ones"),
+    ({"A": [[1, 0], ["-1e60*step(t - 1)", 1]]}, "A[1][0] is -1e+60 at t = 1; numbers go up to"),
+    ({"initial_state": [0, 1e60]}, "initial_state.x2 is 1e+60; numbers go up to 1e+50, product"),
+    ({"inputs": {"V": 1, "I": "-1e60"}}, "inputs.I is -1e+60 at t = 0; numbers go up to"),
+    ({"unknowns": {"theta": 1e60}}, "unknowns.theta is 1e+60 at t = 0; numbers go up to 1e+50"),
+])
+def test_numbers_that_would_overflow_are_named_with_their_time(changes: Plain, says: str) -> None:
+    with refused(says):
+        check_sizes(plant_from_mapping(mine(**changes)), np.array([0.0, 1.0]))
 
 
 @pytest.mark.parametrize("value", [1e-300, 1e45, 1e200, "1e-300*sin(t)", "exp(300*t)"])

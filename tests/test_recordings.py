@@ -33,7 +33,7 @@ from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.guess import _factor, guess
 from gpebo_cli.recordings.hold import edges, held, recording_mesh
 from gpebo_cli.recordings.load import load
-from gpebo_cli.recordings.table import LineReader, read_table, seconds
+from gpebo_cli.recordings.table import DATE, LineReader, read_table, seconds
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
@@ -295,6 +295,19 @@ def test_rows_are_the_same_however_a_stream_is_cut(size):
     assert rows == [[0.0, 1.0, 2.0], [0.5, 1.0, 3.0], [1.0, 2.0, 3.0]]
 
 
+@pytest.mark.parametrize("last", [False, True])
+def test_a_line_without_an_end_is_refused_by_its_number(last):
+    """With the rows before it, whatever pieces they come in."""
+    reader = LineReader("S", DataSettings("csv"), shipped("circuit"))
+    content = b"t,V,y\n0,1,2\n" + b"1" * ((1 << 20) + 1)
+    assert reader.feed(content[:-1]) == ([[0.0, 1.0, 2.0]], "")
+    assert reader.feed(b"1", last=last) == ([], "S, line 3: longer than 1048576 bytes")
+    again = LineReader("S", DataSettings("csv"), shipped("circuit"))
+    assert again.feed(content, last=last) == (
+        [[0.0, 1.0, 2.0]], "S, line 3: longer than 1048576 bytes"
+    )
+
+
 CELLS = st.sampled_from([
     "0", "1", "2.5", "-1e3", ".5", "5.", " 7 ", "\t8", "+9", "1e400", "nan", "inf", "", "１", "1_0",
     "0x1", "True", "\u00a01", "\v2", "3\f", "4\r", "5\0", "1e", '"6"', '"7', "1 2", "\u20289",
@@ -437,6 +450,15 @@ def test_names_units_separators_and_gaps_are_said(tmp_path, missing, t, V):
     np.testing.assert_array_equal([row[1] for row in rows], found.inputs[:, 0])
 
 
+def test_a_decimal_comma_is_the_only_sign_of_a_fraction(tmp_path):
+    path, how = tmp_path / "r.csv", {"separator": ";", "decimal": ","}
+    path.write_text("t;V;y\n0;1,5;2\n0,5;-,25;3e-1\n")
+    assert read(path, **how).samples.inputs.tolist() == [[1.5], [-0.25]]
+    path.write_text("t;V;y\n0;1,5;2\n0,5;2.5;3\n")
+    with pytest.raises(ConfigError, match=r"line 3, column V: '2\.5' is not a num"):
+        read(path, **how)
+
+
 def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(ELSEWHERE, newline="")
@@ -518,6 +540,8 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
         ({"V": [True, False, True]}, "column V: bool"),
         ({"V": [1.0, 2.0, 3j]}, "column V: complex128 is not numbers"),
+        ({"V": [1.0, 2.0, -1e60]}, "row 2, column V: -1e+60 is no number within ±1e+50"),
+        ({"t": ["2024-01-01", "b", "c"]}, "is not numbers; data.time_unit=datetime reads dates"),
     ],
 )
 def test_what_is_wrong_with_a_data_frame(change, part):
@@ -525,6 +549,16 @@ def test_what_is_wrong_with_a_data_frame(change, part):
     frame = pd.DataFrame(good | change)
     with refused(part):
         read("", frame=frame)
+    with refused("has 1 rows; at least 2 are needed"):
+        read("", frame=pd.DataFrame(good).iloc[:1])
+    with refused("row 1, column t: nan"):  # whatever is done about gaps of signals
+        read("", frame=pd.DataFrame(good | {"t": [0.0, np.nan, 1.0]}), missing="hold")
+
+
+def test_dates_of_a_data_frame_may_be_text():
+    dates = ["2024-01-01", "2024-01-01T00:00:02", "2024-01-01T00:01:00"]
+    frame = pd.DataFrame({"t": dates, "V": 1.0, "y": 2.0})
+    assert read("", frame=frame, time_unit="datetime").samples.t.tolist() == [0.0, 2.0, 60.0]
 
 
 @pytest.mark.parametrize(
@@ -537,13 +571,15 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         ({"hold": {"v": "zoh"}}, "data.hold.v: plant circuit has no such signal; those are V, y"),
         ({"separator": "ab"}, "data.separator"),
         ({"separator": ".", }, "data.separator"),
+        ({"file": ["a.csv", "b.csv"]}, "data.file: here one file is needed, not several"),
     ],
 )
 def test_settings_that_do_not_fit_the_file(tmp_path, settings, part):
     path = tmp_path / "r.csv"
     path.write_text(GOOD)
+    given = {"name": "csv", "file": str(path), **settings}
     with refused(part):
-        read(path, **settings)
+        read_table(DataSettings(**given), shipped("circuit"))
 
 
 @pytest.mark.parametrize("name", ["/dev/zero", "pipe"])
@@ -586,6 +622,15 @@ def test_a_span_that_is_not_recorded(tmp_path, time, parts):
     path.write_text(GOOD)
     with refused(*parts):
         load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
+
+
+def test_a_span_that_misses_the_samples_by_rounding_is_theirs(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text("t,V,y\n0.1,1,2\n0.2,1,3\n0.3,2,3\n")
+    for start, horizon in ((0.1, 0.2), (0.1 - 1e-13, 0.2 + 2e-13)):
+        time = TimeSettings(start, horizon, 11)
+        found = load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
+        assert found.span == (0.1, 0.3)
 
 
 def test_measured_columns_are_what_the_observer_sees(tmp_path):
@@ -771,6 +816,7 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     assert any("no column was found for V" in doubt for doubt in found.doubts)
     for content, message in (
         (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
+        (b"t,V,y\n", "lab.csv has no rows below its header"),
         (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
     ):
         path.write_bytes(content)
@@ -794,6 +840,34 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing) == ([], 0)
     assert found.doubts == ["2 cells are 9999: if that means a gap, leave them empty"]
+
+
+    path.write_text("t,V,y\n0,1,-999\n1,2,2\n2,3,-999\n3,2,2.5\n")
+    assert guess(str(path), shipped("circuit")).gaps == [-999.0]
+
+
+@pytest.mark.parametrize(("head", "time", "said"), [
+    ("when,v [A],Y", "0", {
+        "columns": {"t": "when", "V": "v [A]", "y": "Y"}, "time_unit": "s", "scale": {"V": 1.0},
+        "reasons": {"t": "the first column", "time_unit": "not said in the file",
+                    "V": "by elimination: LOOK AT IT", "y": "the same name but for capitals",
+                    "scale.V": "A in the header, V here: WHICH FACTOR?"},
+        "doubts": ["column v [A] may be in A, V is in V: data.scale.V is the factor between them"],
+    }),
+    ("time (min),V,y [mA]", "0", {
+        "columns": {"t": "time (min)", "V": "V", "y": "y [mA]"}, "time_unit": "min",
+        "scale": {"y": 1e-3}, "doubts": [],
+        "reasons": {"t": "by its name", "time_unit": "from the header", "V": "the same name",
+                    "y": "the name is in the header", "scale.y": "mA in the header, A here"},
+    }),
+    ("t,V,y,note", "later", {
+        "doubts": [f"column t: 'later' is neither a number nor {DATE}", "not read: note"],
+    }),
+])
+def test_each_guess_has_its_reason_and_each_doubt_is_told(tmp_path, head, time, said):
+    (tmp_path / "lab.csv").write_text(f"{head}\n{time},1,2{',a' * head.count('note')}\n")
+    found = guess(str(tmp_path / "lab.csv"), shipped("circuit"))
+    assert {key: getattr(found, key) for key in said} == said
 
 
 def test_an_input_that_steps_is_guessed_to_be_held(tmp_path):

@@ -7,19 +7,26 @@ import json
 import os
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from examples import gpebo
+from factories import make_result, with_figures
 from processes import assert_refused, refused
 
 from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.results import document
-from gpebo_cli.results.report import estimate_table
+from gpebo_cli.experiment.result import NoiseStatistics
+from gpebo_cli.results import document, html
+from gpebo_cli.results.folder import write_run
+from gpebo_cli.results.report import case_table, estimate_table, noise_table
+from gpebo_cli.results.symbols import number_text, with_unit
+from gpebo_cli.results.tables import write_noise
 
 FAST = ("time.samples=51", "time.horizon=8")
 
@@ -57,6 +64,54 @@ def test_an_estimate_stands_since_it_is_within_a_hundredth_of_its_end():
     assert "  3 s  " in row
 
 
+@pytest.mark.parametrize(("count", "shown"), [(12, 12), (13, 12), (30, 12)])
+def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
+    head, *rows = case_table(make_result(gammas=tuple(range(1, count + 1)), samples=5))
+    told = [row.split()[0] for row in rows if "…" not in row]
+    assert head.split()[0] == "gamma"
+    assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
+    assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])
+    assert len(told) == shown
+
+
+@pytest.mark.parametrize("count", [40, 41, 45])
+def test_of_many_cases_a_comparison_prints_the_best(tmp_path, capsys, count):
+    gains = tuple(1e8 * (k + 1) for k in range(count))
+    write_run(with_figures(make_result(gammas=gains, samples=5), False), tmp_path / "run", "")
+    assert compare.main([str(tmp_path / "run"), "--no-figures"]) == 0
+    _, *rows = capsys.readouterr().out.splitlines()
+    column = [float(row.split()[2]) for row in rows[:40]]
+    assert column == sorted(gains, reverse=True)[:40]  # larger ones are faster
+    assert rows[40:] == ([f"… {count - 40} more; --csv FILE has all"] if count > 40 else [])
+    assert compare.main([str(tmp_path / "run"), "--no-figures", "--sort", "plant"]) == 0
+    assert capsys.readouterr().out.split()[:2] == ["run", "plant"]  # though it is the same for all
+
+
+def test_errors_over_seeds_are_told_by_case_and_parameter(tmp_path):
+    result = make_result(gammas=tuple(range(1, 6)), samples=5)
+    bias = np.arange(1.0, 16.0).reshape(5, 3)
+    noise = NoiseStatistics(7, 1.0, ("a", "b", "c"), np.array([4.0, 5.0, 6.0]), bias, 2 * bias,
+                            3 * bias)
+    head, *rows, more = noise_table(noise)
+    assert "over 7 seeds" in head
+    assert [row.split() for row in rows] == [
+        [str(k), name, *(f"{n * bias[k, i]:.2e}" for n in (1, 2, 3))]
+        for k in range(4) for i, name in enumerate(noise.names)
+    ]
+    assert more == "… 1 more cases in noise.csv"
+    write_noise(tmp_path / "noise.csv", result.estimation, noise)
+    table = pd.read_csv(tmp_path / "noise.csv")
+    assert table["case"].tolist() == np.repeat(range(5), 3).tolist()
+    assert (table["gamma"] == table["case"] + 1).all()
+    assert table["parameter"].tolist() == ["a", "b", "c"] * 5
+    assert table["truth"].tolist() == [4.0, 5.0, 6.0] * 5
+    for n, name in enumerate(("bias", "deviation", "rms"), start=1):
+        assert table[name].tolist() == (n * bias).ravel().tolist()
+    assert set(table["seeds"]) == {7}
+    few = replace(noise, bias=bias[:4])
+    assert len(noise_table(few)) == 13
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """A run, a recording, a sweep with a job that fails, and a run of another plant."""
@@ -86,6 +141,13 @@ def page_of(*words: str) -> tuple[Page, str]:
     return Page(text), text
 
 
+def test_rows_that_fail_are_marked_by_their_numbers_below_the_header():
+    written = html.table([["name"], ["a"], ["b"]], failed=[1])
+    assert [line for line in written.splitlines() if "class=fails" in line] == [
+        "<tr class=fails><td>b</td></tr>"
+    ]
+
+
 def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
     page, _ = page_of("circuit")
     summary = json.loads((inside / "circuit" / "summary.json").read_text())
@@ -102,6 +164,19 @@ def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
         path.read_bytes() for path in files
     ]
     assert len(files) == 2
+
+
+@pytest.mark.parametrize(("name", "cases"), [("circuit", ["0", "1"]), ("other", [])])
+def test_estimates_of_every_case_stand_beside_their_truth(inside, name, cases):
+    page, _ = page_of(name)
+    cells = [text for text in page.text if text.strip()]
+    found = json.loads((inside / name / "summary.json").read_text())["estimates"]
+    each = [found[case] for case in cases] or [found]
+    for key, first in each[0].items():
+        row = [with_unit(key, first["unit"] or ""), *(one[key]["value"] for one in each)]
+        row = [x if isinstance(x, str) else number_text(x) for x in (*row, first["true"])]
+        start = cells.index(row[0])
+        assert cells[start : start + len(row)] == row
 
 
 def test_a_picture_that_is_none_or_too_large_is_left_out(inside, tmp_path, monkeypatch):
@@ -169,7 +244,9 @@ def test_titles_from_strangers_are_text(inside, tmp_path):
     assert " ".join(page.text).count(bad) == 2
 
 
-@pytest.mark.parametrize("words", [["nowhere"], ["--ouput=x", "circuit"], [], ["."]])
+@pytest.mark.parametrize("words", [
+    ["nowhere"], ["--ouput=x", "circuit"], [], ["."], ["circuit", "--output", "sweep"],
+])
 def test_wrong_words_of_report(inside, tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path if words == ["."] else inside)
     with pytest.raises(ConfigError):
@@ -215,6 +292,7 @@ def test_plants_and_horizons_have_figures_of_their_own(inside):
         ("cases.csv", lambda text: text.replace("\n0,", "\ninf,", 1), "line 2, column case"),
         ("summary.json", lambda text: text.replace('"value": ', '"value": 1e999, "": ', 1), "JSON"),
         ("summary.json", lambda text: text.replace('"value": ', '"x": NaN, "value": ', 1), "JSON"),
+        ("cases.csv", lambda text: text.replace("\n0,", "\n7,", 1), "there is no case 7"),
         ("cases.csv", lambda text: text + "1,2\n", "line 4: 2 cells; the header has"),
         ("cases.csv", lambda text: text.replace("case,", "csae,", 1), "there is no column case"),
         ("cases.csv", lambda text: text.replace("\n0,", "\n,", 1), "line 2, column case"),
@@ -230,7 +308,8 @@ def test_what_is_wrong_in_a_table_is_named(inside, tmp_path, file, change, said)
     shutil.copytree("circuit", tmp_path / "run")
     path = tmp_path / "run" / file
     path.write_text(change(path.read_text()))
-    with refused(str(path), said, by=GpeboError):
+    where = tmp_path / "run" / ("estimates.csv" if "no case" in said else file)
+    with refused(str(where), said, by=GpeboError):
         compare.main([str(tmp_path / "run"), "--output", str(tmp_path / "out")])
 
 

@@ -14,16 +14,16 @@ from types import SimpleNamespace
 import pytest
 from omegaconf import OmegaConf
 from plants import DECAYING
-from processes import assert_refused, begin, printed, rows_of, wait_for
+from processes import assert_refused, begin, printed, refused, rows_of, wait_for
 from processes import process as gpebo
 from scipy.integrate import trapezoid
 
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
 from gpebo_cli.cli.progress import Progress
-from gpebo_cli.cli.sweep import _launch, _overrides
-from gpebo_cli.cli.sweep_progress import Watch
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failures
+from gpebo_cli.cli.sweep_progress import Watch, told
+from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.sweep_folder import JobRecord, Plan, read_plan, read_record, write_record
 
@@ -300,6 +300,40 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     assert re.search(r"0 +1e6 +done +0\.5 +5\.25", said)
     assert re.search(r"1 +1e\+08 +failed +0\.5", said)
     assert "plant" not in said, "what is the same for all is left out"
+    assert not Watch(tmp_path, Plan(jobs, "x"), [0], quiet=True)._terminal
+
+
+@pytest.mark.parametrize(("cell", "shown"), [
+    ("drem", "drem"), ("", ""), ("100000", "100000"), ("1000000", "1e+06"), ("0.123456", "0.1235"),
+    ("sin(2.5*t)", "sin(2.5*t)"), ("1e8", "1e8"), ("100000000.0", "1e+08"),
+])
+def test_long_numbers_are_shown_with_four_digits(cell, shown):
+    assert told(cell) == shown
+
+
+def test_of_a_long_table_and_of_many_failures_the_first_ones_are_told(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    records = [
+        JobRecord(k, {"a": str(k)}, "failed" if k < 7 else "done", 0.5, "why" * (k < 7))
+        for k in range(25)
+    ]
+    for count, more in ((25, ["… 5 more"]), (21, ["… 1 more"]), (20, [])):
+        _print_table(records[:count], tmp_path / "s", rows=True)
+        head, *body = capsys.readouterr().out.splitlines()
+        assert head.split()[:2] == ["job", "a"]
+        assert [line.split()[0] for line in body[:20]] == [str(k) for k in range(20)]
+        ends = ["s/results.csv", f"{count} jobs, {count - 7} done, 7 failed"]
+        assert body[20:] == [*more, *ends]
+    failures = "; ".join(f"job {k}: why" for k in range(5))
+    for count, more in ((7, "; and 2 more in results.csv"), (5, "")):
+        with pytest.raises(GpeboError) as caught:
+            _raise_failures([*records[:count], records[-1]], tmp_path / "s", "", stopped=False)
+        assert str(caught.value) == f"{count} of {count + 1} jobs failed: {failures}{more}"
+    with refused("the launcher gave up: it died", by=GpeboError):
+        _raise_failures(records[7:], tmp_path / "s", "it died", stopped=False)
+    _raise_failures(records[7:], tmp_path / "s", "", stopped=False)
 
 
 def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monkeypatch):
@@ -413,6 +447,56 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 
+def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():
+    from gpebo_cli.results.comparison import _labels
+    from gpebo_cli.results.finished import Case
+
+    def labels(*of):
+        cases = [Case(run, Path(run), 0, {"estimator": name}, {"gamma": gain}, {})
+                 for run, name, gain in of]
+        return _labels(cases, cases[1:])
+
+    assert labels(("a", "drem", 1.0), ("a", "drem", 10.0)) == ["γ = 10"]
+    assert labels(("a", "drem", 1.0), ("a", "mre", 10.0)) == ["mre, γ = 10"]
+    assert labels(("a", "drem", 1.0), ("b", "drem", 1.0)) == ["b"]
+    both = (("a", "drem", 1.0), ("b", "drem", 1.0), ("b", "drem", 10.0))
+    assert labels(*both) == ["b, γ = 1", "b, γ = 10"]
+    assert labels(*both[:2], ("c", "drem", 10.0)) == ["b", "c"]
+
+
+def test_a_map_has_each_case_in_its_place():
+    import numpy as np
+
+    from gpebo_cli.results.comparison import heat_grid
+    from gpebo_cli.results.finished import Case
+
+    def cases(*places):
+        return [Case("r", Path("r"), 0, {}, {"a": a, "b": b}, {"rms": 10 * a + b})
+                for a, b in places]
+
+    x, y, values = heat_grid(cases((2, 5), (1, 4), (2, 4)), "a", "b", "rms")
+    assert (x.tolist(), y.tolist()) == ([1, 2], [4, 5])
+    np.testing.assert_array_equal(values, [[14, 24], [np.nan, 25]])
+    assert heat_grid(cases((1, 4), (1, 5)), "a", "b", "rms") is None  # one column
+    assert heat_grid(cases((1, 4), (2, 5)), "a", "b", "rms") is not None
+    assert heat_grid(cases((1, 4), (2, 5), (3, 6), (4, 7)), "a", "b", "rms") is None
+    assert heat_grid(cases((1, 4), (2, 5)), "a", "b", "other") is None
+
+
+@pytest.mark.parametrize(("values", "told"), [
+    ([[1, 2], [3, 1000]], ["1", "10", "1e+02", "1e+03"]),
+    ([[0, 2], [3, 90]], ["0", "30", "60", "90"]), ([[1, 2], [3, 4]], ["1", "2", "3", "4"]),
+])
+def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
+    import numpy as np
+
+    from gpebo_cli.results.comparison import _heat_map
+
+    x = np.array([1.0, 10.0])
+    figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "")
+    assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
+
+
 def test_error_curves_are_those_of_the_run(tmp_path):
     import numpy as np
     import pandas as pd
@@ -429,9 +513,11 @@ def test_error_curves_are_those_of_the_run(tmp_path):
     assert slow.parameters[0] == fast.parameters[0] == pytest.approx(np.sqrt(1.5**2 + 0.64 + 2))
     assert slow.parameter_size == slow.parameters[0]
     x = pd.read_csv(tmp_path / "a" / "signals.csv")[["x1", "x2", "x3"]]
-    hats = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")[[f"{i}_hat" for i in x]]
-    away = np.linalg.norm(hats.to_numpy() - x.to_numpy(), axis=1)
+    estimates = pd.read_csv(tmp_path / "a" / "estimates.csv").query("case == 0")
+    away = np.linalg.norm(estimates[[f"{i}_hat" for i in x]].to_numpy() - x.to_numpy(), axis=1)
     np.testing.assert_allclose(slow.states, away)
+    away = estimates.to_numpy()[:, 2:6] - [1.5, -0.8, -1.0, 1.0]
+    np.testing.assert_allclose(slow.parameters, np.linalg.norm(away, axis=1), rtol=1e-9)
     # The metric is of scaled states, the curves are not: their ratio is that of sizes of states.
     for case, curves in zip(cases, (slow, fast), strict=True):
         rms = np.sqrt(trapezoid(curves.states**2, curves.t) / 20.0)

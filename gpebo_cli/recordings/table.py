@@ -531,10 +531,9 @@ class LineReader:
         After the ``last`` piece what stands behind the last newline is a line, too.
         """
         *lines, self._rest = (self._rest + piece).split(b"\n")
-        if last and self._rest.strip():
+        too_long = len(self._rest) > _LONGEST_LINE
+        if last and self._rest.strip() and not too_long:
             lines.append(self._rest)
-        if len(self._rest) > _LONGEST_LINE:
-            return [], f"{self._source}, line {self._line + 1}: longer than {_LONGEST_LINE} bytes"
         rows: list[list[float]] = []
         try:
             for text in lines:
@@ -546,6 +545,8 @@ class LineReader:
                         rows.extend(self._row(*line))
         except ConfigError as error:
             return rows, str(error)
+        if too_long:
+            return rows, f"{self._source}, line {self._line + 1}: longer than {_LONGEST_LINE} bytes"
         return rows, ""
 
     def _row(self, number: int, line: bytes) -> Iterator[list[float]]:
