@@ -179,6 +179,7 @@ def test_a_kalman_filter_is_the_same_in_any_units(name, moving):
     for key in ("window", "window_start"):
         y[key] /= units.time
     assert y == pytest.approx(x, rel=1e-6)
+    assert not one.estimation.requirement.holds  # of 1 nothing is seen: 0 is no evidence of 0
 
 
 def test_sensors_are_as_good_in_any_units():
