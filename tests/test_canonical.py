@@ -67,7 +67,7 @@ def test_algebraic_zb_is_exact_once_za_is():
     np.testing.assert_allclose(checks["zb2_algebraic"][0, late], truth[late, 3], atol=1e-9)
 
 
-@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1), (1, -1, -1)])
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, 1), (1, 1, -1)])
 def test_zb3_is_not_invented_and_evidence_has_no_sign(signs):
     """Signs of z_b1, z_b2 and the outputs are anybody's choice: so are those of N21, c1 and c2."""
     first, second, outputs = signs
