@@ -604,6 +604,20 @@ def test_up_to_the_time_at_which_growth_is_refused_a_state_is_known(rate, elemen
     simulate(system, TimeSettings(horizon=told - 2.0 * element), SOLVER)
 
 
+@pytest.mark.parametrize(("rate", "allowed", "why"), [
+    ("2000", {}, r"e\^4e\+03, at 2e\+03 1/s near t = 0, .* the 100 elements that solver\.max"),
+    ("1500*t**2", {}, r"e\^4e\+03, at 6e\+03 1/s near t = 1\.999\d*, .* the 100 elements"),
+    ("2000", {"_MOST_FOR_GROWTH": 500}, r"the [1-9]\d elements that the size 1 of A allows"),
+])
+def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monkeypatch):
+    """By e^∫λ, with the largest λ and its time, and what sets the limit: a setting, or memory."""
+    for name, value in allowed.items():
+        monkeypatch.setattr(f"gpebo_cli.simulation.simulate.{name}", value)
+    system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state=[0])
+    with pytest.raises(SolverError, match=why):
+        simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
+
+
 def test_a_rank_that_a_step_changes_is_named_with_what_vanishes():
     """E loses its second row at t = 1: both ranks, times on both sides, and the singular value."""
     system = plant(states=["a", "b"], E=[[1, 0], [0, "1 - step(t - 1)"]], A=[[-1, 0], [0, -2]],
