@@ -673,6 +673,8 @@ def test_nothing_is_given_up_for_rounding_where_assumption_1_fails(share):
     left = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1])
     assert (left[:2] < 1e-9).all()
     assert np.isnan(left[2])
+    (of_E,) = (a.evidence for a in found.assumptions if a.name == "Rank of E")
+    assert of_E["rank"] == 2  # with the part that is given up
 
 
 def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():
