@@ -474,9 +474,14 @@ def with_entry(row, column, entry):
     return {**PENDULUM, "A": A}
 
 
-def test_an_output_in_equations_that_nobody_differentiates():
-    """The pendulum's spring follows the measured position: its row stands in no derivative."""
-    found, error, of_states = observed(with_entry(2, 0, "-2 - seen**2"), 5.0)
+@pytest.mark.parametrize(("load", "pushes"), [(0.7, [0, 0, 1, "cos(t)", 0]), (0.0, [0] * 5)])
+def test_an_output_in_equations_that_nobody_differentiates(load, pushes):
+    """The pendulum's spring follows the measured position: its row stands in no derivative.
+
+    Neither does it where no hidden constraint has part in the unknown.
+    """
+    plant = {**with_entry(2, 0, "-2 - seen**2"), "F": [[entry] for entry in pushes]}
+    found, error, of_states = observed({**plant, "unknowns": {"load": load}}, 5.0)
     assert "strangeness-free" in found.note
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
