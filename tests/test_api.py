@@ -295,6 +295,7 @@ WRONG = [
     ({"gama": 1}, "run: no such keyword gama; estimator ls_drem has initial, alpha, f0"),
     ({"gama": 1}, "did you mean gamma?"),
     ({"horizon": 3}, 'did you mean time={"horizon": …}?'),
+    ({"remedy": "reset"}, 'did you mean observer={"remedy": …}?'),
     ({"estimtor": "drem"}, "did you mean estimator?"),
     ({"estimator": "drm"}, "estimator=drm: there is no such estimator"),
     ({"estimator": {"name": "drem", "gama": 1}}, "estimator.gama: no such key"),

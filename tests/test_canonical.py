@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from plants import experiment, observed, reference, shipped
 from scipy.linalg import expm
+from units import Units, in_units
 
+from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers.canonical import unknown_input_matrices
 from gpebo_cli.settings import SolverSettings
 
@@ -64,12 +67,24 @@ def test_algebraic_zb_is_exact_once_za_is():
     np.testing.assert_allclose(checks["zb2_algebraic"][0, late], truth[late, 3], atol=1e-9)
 
 
-def test_zb3_is_not_invented():
-    result = run(shipped("canonical"), samples=11)
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, 1), (1, 1, -1)])
+def test_zb3_is_not_invented_and_evidence_has_no_sign(signs):
+    """Signs of z_b1, z_b2 and the outputs are anybody's choice: so are those of N21, c1 and c2."""
+    first, second, outputs = signs
+    states, one = np.array([1, 1, first, second, 1]), np.ones
+    system = plant_from_mapping(in_units(files.shipped("plant/canonical"), Units(
+        states, one(0), one(4), np.full(2, outputs), states, 1.0)))
+    result = run(system, samples=11)
     found = {a.name: a.evidence for a in result.assumptions}
     assert found["Assumption 4"]["smallest"] == pytest.approx(0.7, rel=1e-3)  # of N21
     of_c = [found["Assumption 6"][name] for name in ("smallest_c1", "smallest_c2")]
     assert of_c == pytest.approx([0.7, 1.5], rel=1e-3)
+    assert found["Assumption 6"]["output"] == "y2"
+    # ∫−a1 c1/c2 dt by scipy; the diagonal gain adds ln(c1/c2) to the second.
+    integrals = [found["Assumption 7"][name] for name in ("integral_M11", "integral_M22")]
+    assert integrals == pytest.approx([-11.166597, -11.519049], rel=1e-6)
+    assert found["Assumption 7"]["transition_norm"] == pytest.approx(np.exp(integrals[0]), rel=1e-4)
+    assert all(a.holds for a in result.assumptions)
     assert np.isnan(result.estimation.states[..., 4]).all()
     assert np.isfinite(result.metrics.final_error_states).all()
 
@@ -199,8 +214,8 @@ def test_matrices_against_their_definition():
         ({"C": [[1, 0, 0, 0, 0], [0.5, 0, 0, "c2", 0]]}, {}, ModelError, "Assumption 6 fails"),
         *(
             ({"C": [[1, 0, 0, 0, 0], [0.5, 0, *row]]}, {}, ModelError, "Assumption 6 fails: no")
-            for row in (["c1", "c2", "sin(t)"], ["c1", "cos(t)", 0], ["cos(t)", "c2", 0],
-                        [1e-10, "c2", 0])
+            for row in (["c1", "c2", "sin(t)"], ["c1", "c2", -0.1], ["c1", "cos(t)", 0],
+                        ["cos(t)", "c2", 0], [1e-10, "c2", 0])
         ),
         (
             {"A": (np.diag([-1.0, -2, 1, 1, 1]) + 0.2 * np.eye(5, k=-2)).tolist()}, {},

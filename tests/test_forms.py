@@ -474,9 +474,14 @@ def with_entry(row, column, entry):
     return {**PENDULUM, "A": A}
 
 
-def test_an_output_in_equations_that_nobody_differentiates():
-    """The pendulum's spring follows the measured position: its row stands in no derivative."""
-    found, error, of_states = observed(with_entry(2, 0, "-2 - seen**2"), 5.0)
+@pytest.mark.parametrize(("load", "pushes"), [(0.7, [0, 0, 1, "cos(t)", 0]), (0.0, [0] * 5)])
+def test_an_output_in_equations_that_nobody_differentiates(load, pushes):
+    """The pendulum's spring follows the measured position: its row stands in no derivative.
+
+    Neither does it where no hidden constraint has part in the unknown.
+    """
+    plant = {**with_entry(2, 0, "-2 - seen**2"), "F": [[entry] for entry in pushes]}
+    found, error, of_states = observed({**plant, "unknowns": {"load": load}}, 5.0)
     assert "strangeness-free" in found.note
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
@@ -673,6 +678,8 @@ def test_nothing_is_given_up_for_rounding_where_assumption_1_fails(share):
     left = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1])
     assert (left[:2] < 1e-9).all()
     assert np.isnan(left[2])
+    (of_E,) = (a.evidence for a in found.assumptions if a.name == "Rank of E")
+    assert of_E["rank"] == 2  # with the part that is given up
 
 
 def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():

@@ -213,6 +213,24 @@ def test_window_is_exciting_but_not_uniformly_observable():
     assert failed == ["uniform observability"]
 
 
+def test_uniform_observability_is_measured_by_P0():
+    """Of states that stand still the Gramian is ∫CᵀV⁻¹C: one known at the start counts as others.
+
+    λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations.
+    """
+    result = api_run(
+        {"name": "still", "states": ["a", "b", "c"], "outputs": ["y1", "y2", "y3"],
+         "E": np.eye(3).tolist(), "A": np.zeros((3, 3)).tolist(),
+         "C": np.diag([1, 2, 1]).tolist(), "initial_state": [1, 2, 3]},
+        observer={"name": "kalman_bucy", "P0": {"w_a": 4.0, "w_b": 9.0, "w_c": 0.0}},
+        noise={"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}, time={"horizon": 5.0},
+    )
+    found = result.details.estimation.requirement
+    unit = found.evidence["window"] / (0.02**2 * 0.1)
+    assert found.evidence["lambda_min"] == pytest.approx(4.0 * unit, rel=1e-6)
+    assert found.holds
+
+
 def test_a_wandering_unknown_is_followed():
     system = shipped("descriptor", unknowns={"theta1": "1.5 + step(t - 10)", "theta2": -0.8})
     still = run(system, horizon=30.0, noise=NoiseSettings(outputs=0.01, sample_time=0.1))

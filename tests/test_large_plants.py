@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from benchmarks import ladders
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
-from gpebo_cli.errors import ConfigError
+from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import OnDemand
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import solve
@@ -667,3 +667,24 @@ def test_nine_states_of_which_none_is_differential(chain):
     np.testing.assert_allclose(found["x8"], np.cos(found.t), atol=1e-12)
     np.testing.assert_allclose(found["x4"], chain * np.cos(found.t), atol=1e-11)
     assert abs(found.errors["x0"][0, -1]) < 1e-10
+
+
+@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("n", [8, 9])
+def test_an_index_above_the_limit_is_refused_at_every_size(n, turned):
+    """A chain of index 4 among states of their own: by singular values, and by elimination."""
+    rng, chain = np.random.default_rng(2), np.arange(n) < 4
+    rows, columns = (np.linalg.qr(rng.normal(size=(n, n)))[0] if turned else np.eye(n)
+                     for _ in range(2))
+    E = np.diag(1.0 * ~chain) + np.diag(1.0 * chain[1:], 1)
+    plant = {
+        "name": "chain", "states": [f"x{k}" for k in range(n)], "inputs": {"u": "sin(t)"},
+        "outputs": ["y"], "E": rows @ E @ columns, "A": rows @ np.diag(2.0 * chain - 1.0) @ columns,
+        "B": rows[:, 3:4], "C": np.eye(1, n), "initial_state": np.zeros(n),
+    }
+    short = {"observer": "none", "time": {"horizon": 1, "samples": 3}}
+    found = run(plant, solver={"max_strangeness_index": 3}, **short)
+    assert found.details.simulation.index == 4
+    said = r"above 3, for solver\.max_strangeness_index = 2; it seems to be 4: raise that to 3"
+    with pytest.raises(ModelError, match=said):
+        run(plant, solver={"max_strangeness_index": 2}, **short)

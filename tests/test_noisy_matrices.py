@@ -66,6 +66,8 @@ def test_without_noise_the_copy_changes_nothing():
         truth = observation.truth(t, system.theta_at(t), signals.states)[0]
         eta = observation.regression.least_squares()
         np.testing.assert_allclose(eta, truth, rtol=1e-8, atol=1e-8 * np.abs(truth).max())
+        if system.depends_on_outputs:
+            assert observation.assumptions[-1].evidence["rounds"] == 2  # one shows that none is due
 
 
 def test_unknowns_in_a_noisy_output_are_linearised_with_it():

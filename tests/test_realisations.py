@@ -159,13 +159,12 @@ def test_weights_of_one_over_the_variance_are_the_best():
     assert (rms["none"] < 0.5 * rms["worst"]).all()
 
 
-def test_equal_weights_change_nothing():
+def test_equal_weights_change_nothing_and_an_output_that_has_none_weighs_1():
     system = two_outputs()
-    plain, equal = (
-        observed(system, 2.0, weights=w)[1].regression for w in (None, {"y1": 0.1, "y2": 0.1})
-    )
-    assert plain.Y.values.tobytes() == equal.Y.values.tobytes()
-    assert plain.psi.values.tobytes() == equal.psi.values.tobytes()
+    for weights in ((None, {"y1": 0.1, "y2": 0.1}), ([4.0, 1.0], {"y1": 4.0})):
+        plain, equal = (observed(system, 2.0, weights=w)[1].regression for w in weights)
+        assert plain.Y.values.tobytes() == equal.Y.values.tobytes()
+        assert plain.psi.values.tobytes() == equal.psi.values.tobytes()
 
 
 def test_weighted_elimination_is_weighted_least_squares():

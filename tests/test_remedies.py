@@ -286,6 +286,16 @@ def test_knowledge_of_what_has_decayed_is_bounded():
     )
 
 
+def test_what_nothing_is_known_of_stays_unknown_through_a_reset():
+    """Rounding of the other parameters is no knowledge of one that stands alone."""
+    omega = np.array([[2e6, 0.0, 1e6], [0.0, 0.0, 0.0], [1e6, 0.0, 3e6]])
+    state = ExtensionState(np.column_stack([omega, omega @ [1.0, 5.0, -2.0]]), np.full(3, 1e7))
+    transform = np.array([[1.1, 0.0, 0.3], [0.0, 1.0, 0.0], [-0.7, 0.0, 0.9]])
+    after = state.after(Reset(1.0, transform, np.array([0.1, 0.2, 0.3]), 0.0)).values
+    assert not after[1].any()
+    assert not after[:, 1].any()
+
+
 def with_a_reset_to_the_same():
     """A regression, and the same with T = I, τ = 0 on the way."""
     plain = make_regression(three, ETA)

@@ -16,7 +16,7 @@ from scipy.optimize import OptimizeResult
 from scipy.special import beta
 
 from gpebo_cli import GpeboError, run
-from gpebo_cli.errors import ModelError
+from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -588,6 +588,43 @@ def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
     with pytest.raises(GpeboError, match=why):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))
+
+
+@pytest.mark.parametrize(("rate", "element"), [("500*(t-10)", 0.005), ("20*(t-10)", 0.024)])
+def test_up_to_the_time_at_which_growth_is_refused_a_state_is_known(rate, element):
+    system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
+
+    def refused_from(horizon):
+        with pytest.raises(SolverError, match="a state from") as refusal:
+            simulate(system, TimeSettings(horizon=horizon), SOLVER)
+        return float(re.search(r"from t = ([\d.]+) on", str(refusal.value))[1])
+
+    told = refused_from(20.0)
+    assert refused_from(told + element) == pytest.approx(told, abs=element)
+    simulate(system, TimeSettings(horizon=told - 2.0 * element), SOLVER)
+
+
+@pytest.mark.parametrize(("rate", "allowed", "why"), [
+    ("2000", {}, r"e\^4e\+03, at 2e\+03 1/s near t = 0, .* the 100 elements that solver\.max"),
+    ("1500*t**2", {}, r"e\^4e\+03, at 6e\+03 1/s near t = 1\.999\d*, .* the 100 elements"),
+    ("2000", {"_MOST_FOR_GROWTH": 500}, r"the [1-9]\d elements that the size 1 of A allows"),
+])
+def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monkeypatch):
+    """By e^∫λ, with the largest λ and its time, and what sets the limit: a setting, or memory."""
+    for name, value in allowed.items():
+        monkeypatch.setattr(f"gpebo_cli.simulation.simulate.{name}", value)
+    system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state=[0])
+    with pytest.raises(SolverError, match=why):
+        simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
+
+
+def test_a_rank_that_a_step_changes_is_named_with_what_vanishes():
+    """E loses its second row at t = 1: both ranks, times on both sides, and the singular value."""
+    system = plant(states=["a", "b"], E=[[1, 0], [0, "1 - step(t - 1)"]], A=[[-1, 0], [0, -2]],
+                   initial_state=[1, 1])
+    said = r"changes from 14 at t = 0\.\d+ to 13 at t = 1\.\d+ \(singular value 0\.0e\+00\)"
+    with pytest.raises(ModelError, match=said):
+        simulate(system, TimeSettings(horizon=2.0), SOLVER)
 
 
 def test_what_solve_ivp_says_where_it_gives_up_is_passed_on(monkeypatch):

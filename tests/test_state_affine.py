@@ -23,7 +23,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import Measurements
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
-from gpebo_cli.simulation.newton import _refuse_slow, _window
+from gpebo_cli.simulation.newton import _refuse_slow, _window, follow
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -73,6 +73,26 @@ def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     assert effort.windows == 1
     assert effort.linear_solves <= 4
     assert 0.0 < effort.last_change <= SOLVER.tol
+
+
+@pytest.mark.parametrize("plant", [BOOST, one_state(phi=["-y - abs(y - 0.5)"])])
+def test_the_effort_is_what_was_solved(plant, monkeypatch):
+    """Each linear problem is an iterate, and costs by its digits; instants are met once more."""
+    solved = []
+
+    def counted(system, time, solver, solve):
+        def kept(*arguments):
+            solved.append(arguments[2].tol)
+            return solve(*arguments)
+
+        solved.clear()
+        return follow(system, time, solver, kept)
+
+    monkeypatch.setattr(simulation.simulate, "follow", counted)
+    effort = simulate(plant_from_mapping(plant), TimeSettings(horizon=3.0), SOLVER).effort
+    assert effort.windows == 1
+    assert effort.iterates == len(solved)
+    assert effort.linear_solves == pytest.approx(np.log(solved).sum() / np.log(SOLVER.tol))
 
 
 def test_a_run_says_what_newtons_method_cost():

@@ -163,21 +163,23 @@ def test_what_filters_leave_of_a_column_is_rounding():
     assert result.details.estimable["w_x1"] is None
 
 
-@pytest.mark.parametrize(("name", "states"), [
-    ("window", ["x1", "x2"]), (1, ["x0", "x1"]),
-])
-def test_a_kalman_filter_is_the_same_in_any_units(name, states):
+@pytest.mark.parametrize(("name", "moving"), [("window", [0, 1]), (1, [0, 1])])
+def test_a_kalman_filter_is_the_same_in_any_units(name, moving):
     """Variances have units, and so has what regularises: a variance times a sample time."""
     def observer(by):
-        size = dict(zip([*(f"w_{state}" for state in states), "k0", "k1"],
-                        [*by.states[: len(states)], *by.unknowns], strict=False))
+        units = np.concatenate([by.unknowns, by.states[moving]])
         return {"name": "kalman_bucy", "regularisation": 1e-3 * float(by.time) ** 0.5,
-                "P0": {each: 10.0 * float(unit) ** 2 for each, unit in size.items()}}
+                "P0": (10.0 * units**2).tolist()}
 
     one, other, units = both(name, True, seed=[5, 1], observer=observer)
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
     a, b = (run.estimation.states[0] for run in (one, other))
     assert (np.abs(b / units.states - a) <= 1e-10 * np.abs(a).max(axis=0)).all()
+    x, y = (dict(run.estimation.requirement.evidence) for run in (one, other))
+    for key in ("window", "window_start"):
+        y[key] /= units.time
+    assert y == pytest.approx(x, rel=1e-6)
+    assert not one.estimation.requirement.holds  # of 1 nothing is seen: 0 is no evidence of 0
 
 
 def test_sensors_are_as_good_in_any_units():

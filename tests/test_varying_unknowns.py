@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from plants import left_of_identities, observed, seen, shipped
 from scipy.integrate import solve_ivp
+from units import Units, in_units
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -79,17 +80,21 @@ def test_a_hidden_constraint_takes_derivatives_of_the_unknown(source):
     assert system.theta_at(t)[:, 0] == pytest.approx(value)
 
 
-@pytest.mark.parametrize("plant", ["descriptor", "rotating"])
+@pytest.mark.parametrize("plant", ["descriptor", "rotating", "rotating, other units"])
 def test_the_regression_holds_with_the_truth_that_varies(plant):
     if plant == "descriptor":
         system = shipped("descriptor", unknowns=STEP)
     else:  # the kernel of E rotates: the extension is integrated in all coordinates
-        system = plant_from_mapping({
+        content = {
             "name": "rotating", "states": ["x1", "x2"], "unknowns": {"a": "1 + t/4"},
             "outputs": ["y1", "y2"], "E": [["cos(t)", "sin(t)"], [0, 0]],
             "A": [[-1, 0.5], ["-sin(t)", "cos(t)"]], "F": [[1], [0.3]],
-            "C": [[1, 0], [0.2, 1]], "initial_state": [1, 0],
-        })
+            "C": [[1, 0], [0.2, 1]], "initial_state": {"x1": 1, "x2": 0},
+        }
+        states = np.array([1.0, 1e-3] if "units" in plant else [1.0, 1.0])
+        system = plant_from_mapping(in_units(
+            content, Units(states, np.ones(1), np.ones(0), np.ones(2), np.ones(2), 1.0)
+        ))
     signals, observation = observed(system, 4.0)
     t = np.linspace(0.0, 4.0, 41)
     assert max(left_of_identities(system, signals, observation, t)) < 2e-9

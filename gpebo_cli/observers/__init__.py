@@ -47,7 +47,7 @@ __all__ = [
 
 _OBSERVERS: Registry[Observer] = Registry("observer")
 GROUP = _OBSERVERS.group
-names, able = _OBSERVERS.names, _OBSERVERS.able
+names, settings_of, able = _OBSERVERS.names, _OBSERVERS.settings_of, _OBSERVERS.able
 _NONE = "none"  # simulate only
 
 
@@ -57,11 +57,6 @@ def build(settings: Mapping[str, object]) -> Observer | None:
     It is None for the name none: there is a simulation, and nobody observes it.
     """
     return None if settings.get("name") == _NONE else _OBSERVERS.build(settings)
-
-
-def settings_of(settings: Mapping[str, object]) -> list[str]:
-    """The settings that the observer called ``settings["name"]`` has."""
-    return [] if settings.get("name") == _NONE else _OBSERVERS.settings_of(settings)
 
 
 def sampling(observer: Observer | None) -> Sampling | None:

@@ -177,11 +177,16 @@ def _refuse_limit(
         if levels.reference is None:
             continue
         if levels.a == constraints:  # two in a row: rounding does not find the same ones
-            raise ModelError(
-                f"the index of {who(system)} is above {max_mu + 1}, for solver."
-                f"max_strangeness_index = {max_mu}; it seems to be {mu}: raise that to {mu - 1}"
-            )
+            raise index_above(system, max_mu, mu)
         constraints = levels.a
+
+
+def index_above(system: DescriptorSystem, max_mu: int, index: int) -> ModelError:
+    """The refusal of a plant of this index, where μ may be ``max_mu`` at most."""
+    return ModelError(
+        f"the index of {who(system)} is above {max_mu + 1}, for solver.max_strangeness_index = "
+        f"{max_mu}; it seems to be {index}: raise that to {index - 1}"
+    )
 
 
 def _in_stages(

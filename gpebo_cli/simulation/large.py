@@ -41,7 +41,7 @@ from gpebo_cli.reduction.explicit import (
     sizes_of,
 )
 from gpebo_cli.reduction.scaling import Scaling
-from gpebo_cli.reduction.structure import Structure, analyse, without_equations
+from gpebo_cli.reduction.structure import Structure, analyse, index_above, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.known import (
     SHORT,
@@ -138,10 +138,14 @@ class _Plant:
         if self.constant is None and not (may_be_full and len(found.which("E")) > _ENTRIES * n):
             try:
                 self.scaling = self.scaling or scaling_of(found, n)
-                return explicit_form(found, self.scaling, f)
+                form = explicit_form(found, self.scaling, f)
             except UndecidedError as error:
                 if isinstance(error, MoreOrdersError) or not may_be_full:
                     raise
+            else:
+                if form.mu >= self.most:
+                    raise index_above(self.system, self.most - 1, form.mu + 1)
+                return form
         if self.constant is None:
             full = np.zeros((2, n, n))
             for matrix, name, values in zip(full, "EA", (E, A), strict=True):

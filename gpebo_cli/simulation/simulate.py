@@ -257,10 +257,11 @@ def _growth_resolved(
         parts = np.maximum(1.0, np.ceil(mesh.steps * (rates / SHORT)))
         if parts.sum() > most:
             worst = int(np.argmax(rates))
+            by = "solver.max_elements" if most == solver.max_elements else f"the size {n} of A"
             raise SolverError(
-                f"the plant {system.name} may grow by a factor of e^{SHORT * parts.sum():.3g}, at "
+                f"the plant {system.name} may grow by a factor of e^{mesh.steps @ rates:.3g}, at "
                 f"{rates[worst]:.3g} 1/s near t = {mesh.edges[worst]:.6g}, which takes more than "
-                f"solver.max_elements = {most:.0f} elements; shorten time.horizon"
+                f"the {most:.0f} elements that {by} allows; shorten time.horizon"
             )
     return mesh.split(parts.astype(np.intp))[0]
 
