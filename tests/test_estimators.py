@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
-from scipy.integrate import trapezoid
+from scipy.integrate import quad_vec, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
@@ -599,6 +599,21 @@ def test_a_gain_that_is_auto_settles_before_the_end(name):
     assert f"γ ≥ {least:.2g}" in said.text
     assert estimate(name, CLEAN, gamma=1.01 * least).requirement.holds
     assert not estimate(name, CLEAN, gamma=0.5 * least).requirement.holds
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.4])
+def test_least_squares_needs_the_weakest_direction_to_outweigh_the_prior(beta):
+    """α λ_min(G)/(z f₀) by quadrature, of the case that has the least of it."""
+    G = quad_vec(lambda s: np.exp(-beta * (10.0 - s)) * np.outer(three(s), three(s)), 0.0, 10.0)[0]
+    least = np.linalg.eigvalsh(G)[0] / np.exp(-10.0 * beta)
+    cases = {"alpha": [0.5, 2.0], "f0": [1e-4, 1e-3], "beta": beta}
+    reached = estimate("least_squares", CLEAN, **cases).requirement.evidence
+    assert reached["alpha_lambda_min_over_f0"] == pytest.approx(0.5 * least / 1e-3, rel=1e-9)
+    for share, holds in ((1.01, True), (0.99, False)):
+        gains = {"alpha": 2.0, "f0": 2.0 * least / (share * 99.0), "beta": beta}
+        said = estimate("least_squares", CLEAN, **gains).requirement
+        assert said.holds == holds
+        assert f"is {share * 99.0:.3g} times f₀; 1 % of the initial error needs 99" in said.text
 
 
 def test_a_gain_that_is_auto_is_not_for_samples():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -123,6 +124,21 @@ def test_a_fading_regressor_is_ie_and_not_pe():
     assert not persistent(outer(faded), 100.0).holds
     assert persistent(outer(CLEAN), 1e5).holds
     assert not persistent(outer(CLEAN), 1e-3).holds
+
+
+def test_a_gain_is_enough_by_the_window_that_has_least():
+    """Windows of a tenth of the horizon, which begin at hundredths of it, by quadrature."""
+    cuts = np.linspace(0.0, 10.0, 101)
+    parts = np.array([gram(three, *ends) for ends in pairwise(cuts)])
+    level = min(np.linalg.eigvalsh(parts[k : k + 10].sum(axis=0))[0] for k in range(91))
+    for share, holds in ((1.01, True), (0.99, False)):
+        gain = share * np.log(100.0) / 10.0 / level
+        found = persistent(outer(CLEAN), gain)
+        assert found.holds == holds
+        assert found.evidence == pytest.approx({
+            "pe_level": level, "window": 1.0, "gamma_times_level": gain * level,
+            "needed": np.log(100.0) / 10.0,
+        }, rel=1e-8)
 
 
 def test_settling_time_of_an_exponential_is_exact():

@@ -263,6 +263,9 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     left = np.concatenate([rows[..., :3].reshape(-1, 3), prior * np.eye(3)])
     right = np.concatenate([rows[..., 3].ravel(), prior * np.full(3, 0.7)])
     np.testing.assert_allclose(estimate, np.linalg.lstsq(left, right, rcond=None)[0], rtol=1e-11)
+    squares = np.linalg.eigvalsh(np.einsum("kri,krj->ij", rows[..., :3], rows[..., :3]))
+    reached = recursion.requirement.evidence["alpha_lambda_min_over_f0"]
+    assert reached == pytest.approx(squares[0] / prior**2, rel=1e-9)
 
 
 def test_the_square_root_form_survives_what_normal_equations_do_not():
@@ -420,16 +423,20 @@ def test_the_monotone_law_at_samples(gain):
     block, truth = regression(K=25, steps=RNG.uniform(0.02, 0.05, 25)), np.array([-2.0, 8.0])
     block.rows[..., 3] = block.rows[..., :3] @ S.values(truth[None])[0]
     built = estimators.build({"name": "monotone", "gamma": gain, "lambda": 1.0})
-    recursion, (_, T, _, theta) = built.recursive(["e", "f", "g"]), built.law(S)
+    recursion, (_, T, mu, theta) = built.recursive(["e", "f", "g"]), built.law(S)
     with pytest.raises(ConfigError, match="is for a regression with S"):
         built.recursive(["e", "f", "g"]).update(block)
     made = recursion.update(replace(block, parametrisation=S))
     eta = made.parameters  # (a, √b, a + b), from which θ̂ is read off
     found = np.stack([eta[..., 0], eta[..., 1] ** 2], axis=2)
     assert (np.diff(np.linalg.norm(found - truth, axis=2), axis=1) <= 1e-9).all()
-    assert recursion.requirement.evidence["integral_delta_squared"] > 0.0
+    extended = KreisselmeierFilter(np.ones(3)).update(block)
+    energy = block.steps @ np.linalg.det(extended[..., :3]) ** 2
+    assert recursion.requirement.evidence == pytest.approx({
+        "integral_delta_squared": energy, "gamma_times_integral": np.min(gain) * energy,
+        "needed": np.log(100.0) / mu,
+    }, rel=1e-9)
     if gain == 5.0:
-        extended = KreisselmeierFilter(np.ones(3)).update(block)
         for k, omega in enumerate(extended[..., :3]):
             x = gain * np.linalg.det(omega) ** 2 * block.steps[k]
             flow = solve_ivp(
