@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
-from scipy.integrate import quad_vec
+from scipy.integrate import quad_vec, trapezoid
 from scipy.optimize import brentq
 
 from gpebo_cli import run
@@ -201,3 +201,42 @@ def test_sizes_of_terms_are_those_of_the_element_of_each_time():
     scale = np.arange(12.0).reshape(4, 3)
     made = replace(regression(three, ETA, elements=4), scale=scale)
     assert (made.terms(np.array([1.0, 4.0, 6.0, 9.0])) == scale).all()
+
+
+@pytest.mark.parametrize(("rho", "said"), [
+    (None, "interval-exciting from t = {0.t_c:.4g} s on (λ_min(G) = {0.level:.3g} with unit diag"),
+    (0.01, "interval-exciting from t = {0.t_c:.4g} s on (λ_min(G) = {0.lambda_min:.3g}, ρ = 0.01"),
+    (0.5, "NOT interval-exciting: λ_min(G) = {0.lambda_min:.3g}, ρ = 0.5; not excited: "),
+])
+def test_the_last_line_of_a_run_says_what_was_found(rho, said):
+    """Of the case whose state error falls below 1 % first."""
+    given = {"excitation": {"rho": rho}, "time": {"samples": 81}}
+    details = run("descriptor", estimator="ls_drem", gamma=[1.0, 5.0], **given).details
+    found, error = details.metrics, np.abs(details.estimation.states - details.simulation.states)
+    assert details.verdict.startswith(said.format(details.excitation))
+    more = ("not excited: {0.weakest_direction}" if rho == 0.5 else
+            "), parameters well determined from t = {0.determined:.4g} s on")
+    assert details.verdict.endswith(more.format(details.excitation) + (
+        f"; state error {error[1, -1].max():.2g} at the end, below 1 % after "
+        f"{found.seconds_to_1pct_states[1]:.4g} s (alpha = 1, f0 = 0.0001, beta = 0, gamma = 5)"
+    ))
+    slow = run("descriptor", estimator="gradient", gamma=[1e-3, 1e-2], **given).details
+    error = np.abs(slow.estimation.states[:, -1] - slow.simulation.states[-1]).max(axis=1)
+    case = int(error.argmin())
+    assert (f"state error {error[case]:.2g} at the end, never below 1 % "
+            f"(gamma = {slow.estimation.cases[case]['gamma']:g}); PE not met: ") in slow.verdict
+
+
+def test_the_last_line_says_how_much_of_a_recording_is_explained():
+    """Root mean squares over time, here by the trapezoidal rule."""
+    made = run("descriptor", observer="none", time={"samples": 401})
+    noise = 0.05 * np.random.default_rng(1).standard_normal(401)
+    data = {"t": made.t, **made.inputs, "y": made["y"] + noise}
+    details = run("descriptor", data=data, estimator="ls_drem", gamma=[1.0, 0.01]).details
+    r, fit, final = details.regression, details.fit, details.estimation.parameters[:, -1]
+    for eta, told in zip((*final, 0.0 * final[0]), (*fit.residual, fit.size), strict=True):
+        square = trapezoid(((r.Y - r.psi @ eta) ** 2).sum(axis=1), r.t) / np.ptp(r.t)
+        assert told == pytest.approx(np.sqrt(square), rel=0.02)
+    assert fit.residual.argmin() == 0
+    assert (f"; |Y − ψη̂| with the final estimates is {fit.residual[0]:.2g}, |Y| is {fit.size:.2g} "
+            "(root mean squares)") in details.verdict

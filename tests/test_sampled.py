@@ -277,6 +277,9 @@ def test_the_square_root_form_survives_what_normal_equations_do_not():
     quotient, usable, _ = quotient_of(spectrum(roots[:, 0], memory[:, 0]))
     assert usable[-1]
     np.testing.assert_allclose(quotient[-1], eta, atol=1e-5)
+    small = quotient_of(spectrum(1e-20 * roots[:, 0], memory[:, 0]))  # in other units of Y
+    np.testing.assert_array_equal(small[1], usable)
+    np.testing.assert_allclose(small[0], quotient, rtol=1e-4)
     rows = block.weighted().reshape(-1, 3)
     normal = rows.T @ rows  # its condition is 1e18
     assert np.linalg.eigvalsh(normal[:2, :2])[0] < 1e-15 * normal[0, 0]
@@ -316,7 +319,13 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     block.rows[20:] = regression(K=20, r=3, hold="linear").rows
     part = replace(block, t=block.t[19:], steps=block.steps[19:], rows=block.rows[19:])
     own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
-    np.testing.assert_array_equal(own.update(block)[19:], late.update(part))
+    whole = own.update(block)
+    np.testing.assert_array_equal(whole[19:], late.update(part))
+    own, found = estimators.build({"name": "lion"}).at_samples(rates), []
+    for a, b in pairwise([0, 1, 10, 25, 40]):
+        rows = block.rows[a : b + 1]
+        found.append(own.update(replace(block, t=block.t[a:b], steps=block.steps[a:b], rows=rows)))
+    np.testing.assert_allclose(np.concatenate(found), whole, atol=1e-13)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

@@ -473,6 +473,26 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     assert size.max() < 2.2
 
 
+@pytest.mark.parametrize(("name", "gains"), [
+    ("drem", {"gamma": [1e13, 5e13]}), ("ls_drem", {"gamma": [2.0, 10.0], "f0": 1e-2}),
+])
+def test_the_finite_time_law_is_as_uncertain_as_what_it_divides_by_makes_it(name, gains):
+    """η̂_f = (η̂ − w_c η̂(0))/(1 − w_c), w_c ≤ 1 − μ: the share of the start that is left in η̂."""
+    extension = {"drem": "kreisselmeier", "ls_drem": "least_squares"}[name]
+    plain, corrected = (
+        {"name": name, **gains}, {"name": "fct", "extension": extension, "mu": 0.2, **gains}
+    )
+    time = {"horizon": 10, "samples": 11}
+    left = 1.0 - run("descriptor", estimator=plain, time=time).estimates["theta1"] / 1.5
+    one, other = (
+        run("descriptor", estimator=law, noise=NOISE, time=time).details.estimation.parameters_std
+        for law in (plain, corrected)
+    )
+    made = one[:, 1:, 0] / (1.0 - np.minimum(left[:, 1:], 0.8))
+    np.testing.assert_allclose(other[:, 1:, 0], made, rtol=1e-6)
+    assert np.ptp(left[:, 2:-2]) > 0.9
+
+
 @pytest.mark.parametrize(("plant", "more", "why"), [
     ("descriptor", {"gamma": "logspace(0,2,33)"}, "each of 33 cases would take a pass of its own"),
     ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
