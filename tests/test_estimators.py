@@ -25,6 +25,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
+from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -851,6 +852,19 @@ def test_how_far_estimates_may_be_off_is_how_far_they_are(observer, name, small,
         assert off[quantity] <= 3.0 * doubt + 1e-9
         assert doubt <= 10.0 * off[quantity] + 1e-9
     assert told
+
+
+def test_a_parameter_has_the_size_with_which_it_alone_would_explain_the_data():
+    """√(∫Y²/∫ψ_j²) by quadrature; a zero one is compared with that, and no other one is."""
+    *squares, of_Y = quad_vec(
+        lambda s: np.append(three(s) ** 2, (three(s) @ ETA + wobble(s)) ** 2), 0.0, 10.0
+    )[0]
+    natural = accuracy.natural_sizes(NOISY, 3)
+    np.testing.assert_allclose(natural, np.sqrt(of_Y / squares), rtol=1e-9)
+    assert not accuracy.natural_sizes(NOISY, 5).any()
+    truth = np.array([[0.0, 1e-3, -2.0], [0.0, -2e-3, 1.0]])
+    sizes, _ = accuracy.sizes_of(truth, natural, truth)
+    np.testing.assert_array_equal(sizes, [natural[0], 2e-3, 2.0])
 
 
 def test_a_stream_says_which_estimates_are_far_from_least_squares():
