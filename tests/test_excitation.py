@@ -225,6 +225,7 @@ def test_the_last_line_of_a_run_says_what_was_found(rho, said):
     case = int(error.argmin())
     assert (f"state error {error[case]:.2g} at the end, never below 1 % "
             f"(gamma = {slow.estimation.cases[case]['gamma']:g}); PE not met: ") in slow.verdict
+    assert ", times γ = 0.001 is " in slow.verdict
 
 
 def test_the_last_line_says_how_much_of_a_recording_is_explained():

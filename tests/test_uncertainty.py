@@ -94,12 +94,14 @@ def test_an_estimate_that_follows_samples_at_once_does_so_between_them(rate):
 def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
     """White samples around a constant: σ² is Σ(y − mean)²/(N − 1), which has no bias."""
     sample = np.random.default_rng(3).normal(2.0, 0.3, 5)
-    regression = LinearRegression.from_functions(
-        lambda t: np.ones((*t.shape, 1, 1)),
+    regression, small = (LinearRegression.from_functions(
+        lambda t, size=size: np.full((*t.shape, 1, 1), size),
         lambda t: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1), ["a"], 5.0, 5,
-    )
-    level = noise_level(directly, regression, Rows(np.linspace(0.0, 5.0, 6)), np.ones(1))
-    assert level == pytest.approx(np.std(sample, ddof=1), rel=1e-9)
+    ) for size in (1.0, 1e-5))
+    some, more = np.linspace(0.0, 5.0, 6), np.arange(-7.0, 9.0)  # with rows of others
+    for about, rows in ((regression, some), (regression, more), (small, some)):
+        level = noise_level(directly, about, Rows(rows), np.ones(1))
+        assert level == pytest.approx(np.std(sample, ddof=1), rel=1e-9)
 
 
 def test_the_level_of_segments_is_their_mean_square_over_time(monkeypatch):
