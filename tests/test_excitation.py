@@ -182,6 +182,30 @@ def test_norms_that_start_at_rounding_have_settled_at_once():
     assert np.isnan(found[[0, 2]]).all()
 
 
+def test_metrics_are_those_of_the_errors_of_parameters_and_states():
+    """Each in units of its size where they are added up; times to within 5 ms."""
+    time = {"horizon": 4.0, "samples": 801}
+    details = run("descriptor", estimator="ls_drem", gamma=[30.0, 90.0], time=time).details
+    found, of, x = details.metrics, details.estimation, details.simulation.states
+    assert len(of.t) == 801
+    errors = [of.parameters - of.true_parameters, of.states - x]
+    sizes = [np.abs(of.true_parameters).max(axis=0), np.abs(x).max(axis=0)]
+    squares = [((e / size) ** 2).sum(axis=2) for e, size in zip(errors, sizes, strict=True)]
+    rms = np.sqrt(trapezoid(squares[1], of.t, axis=1) / 4.0)
+    np.testing.assert_allclose(found.rms_error_states, rms, rtol=0.01)
+    names = (*of.names, *details.system.states)
+    each = np.concatenate(errors, axis=2) ** 2
+    told = [found.seconds_to_1pct_parameters, found.seconds_to_1pct_states,
+            *(found.seconds_to_1pct[name] for name in names)]
+    for seconds, values in zip(told, [*squares, *np.moveaxis(each, 2, 0)], strict=True):
+        above = values > 1e-4 * values[:, :1]
+        last = [of.t[row.nonzero()[0][-1]] for row in above]
+        np.testing.assert_allclose(seconds, last, atol=0.005 + 1e-9)
+    for final, error in zip((found.final_error_parameters, found.final_error_states), errors,
+                            strict=True):
+        np.testing.assert_allclose(final, np.abs(error[:, -1]).max(axis=1), rtol=1e-6)
+
+
 def test_time_rms():
     t = np.linspace(0, 2 * np.pi, 20_001)
     assert time_rms(t, np.sin(t)[None] ** 2)[0] == pytest.approx(np.sqrt(0.5), rel=1e-6)
