@@ -617,6 +617,24 @@ def test_least_squares_needs_the_weakest_direction_to_outweigh_the_prior(beta):
         assert f"is {share * 99.0:.3g} times f₀; 1 % of the initial error needs 99" in said.text
 
 
+@pytest.mark.parametrize(("gamma", "first", "segment"), [
+    (10.0, 6.0, 1), (3.0, 1.0, 2), (0.1, 6.0, 3),
+])
+def test_what_is_required_is_that_of_the_first_segment_that_has_it(gamma, first, segment):
+    """Or of the last one, where none has; the first one has it as a run until then."""
+    def required(horizon, **observer):
+        return gpebo_cli.run(
+            "descriptor", estimator={"name": "ls_drem", "gamma": gamma, "f0": 1e-3},
+            observer={"name": "gpebo", **observer}, time={"horizon": horizon, "samples": 11},
+        ).details.estimation.requirement
+
+    found = required(20.0, remedy="reset", reset_times=[first, 14.0])
+    assert found.text.startswith(f"in segment {segment} of the 3 between resets, γ∫Δ² = ")
+    assert found.holds == (segment < 3)
+    if segment == 1:
+        assert found.evidence == pytest.approx(required(6.0).evidence, rel=1e-6)
+
+
 def test_a_gain_that_is_auto_is_not_for_samples():
     with pytest.raises(ConfigError, match="auto needs to know the signals to their end"):
         estimators.build({"name": "drem", "gamma": "auto"}).recursive(["a"])
