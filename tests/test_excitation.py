@@ -50,6 +50,11 @@ def test_eigenvalues_and_window_against_quadrature():
             found.gram_eigenvalues[k], np.linalg.eigvalsh(gram(three, 0, T[k])), atol=1e-11
         )
     assert found.lambda_min == pytest.approx(found.gram_eigenvalues[200, 0], rel=1e-12)
+    G = gram(three, 0, 10.0)
+    values, vectors = np.linalg.eigh(G / np.sqrt(np.outer(*[np.diag(G)] * 2)))
+    assert (found.level, found.condition) == pytest.approx((values[0], values[-1] / values[0]))
+    weakest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
+    assert list(found.weakest_direction.components.values()) == pytest.approx(weakest)
     assert np.isnan(found.pe_level[T < 2.5]).all()
     for k in (50, 111, 200):
         expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
