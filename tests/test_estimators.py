@@ -795,16 +795,18 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.4])
-def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta):
-    """Of Y = 2 + sin(t) and ψ = 1: T η̂' = 50 (x/T − η̂), where x' = Y − βx is the memory."""
+@pytest.mark.parametrize(("beta", "more"), [
+    (0.0, np.sin), (0.4, np.sin), (0.0, lambda t: -0.1 * t),
+])
+def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta, more):
+    """Of Y = 2 + sin(t), or a Y that falls, and ψ = 1: T η̂' = 50 (x/T − η̂), x' = Y − βx."""
     T = np.linspace(0.5, 6.0, 12)
-    signal = regression(lambda t: np.ones((*t.shape, 1)), np.array([2.0]), 6.0, disturbance=np.sin)
+    signal = regression(lambda t: np.ones((*t.shape, 1)), np.array([2.0]), 6.0, disturbance=more)
     found = estimate("ls_drem", signal, T, beta=beta).parameters(slice(None))[0, :, 0]
 
     def rates(t, x):
         memory = -np.expm1(-beta * t) / beta if beta else t
-        return [2.0 + np.sin(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
+        return [2.0 + more(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
 
     exact = integrate(rates, [2e-3, 2.0], np.append(1e-3, T))[1:, 1]
     np.testing.assert_allclose(found, exact, rtol=1e-6)
