@@ -796,7 +796,7 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
 
 
 @pytest.mark.parametrize(("beta", "more"), [
-    (0.0, np.sin), (0.4, np.sin), (0.0, lambda t: -0.1 * t),
+    (0.0, np.sin), (0.4, np.sin), (0.0, lambda t: 2.0 * np.expm1(-3.0 * t)),
 ])
 def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta, more):
     """Of Y = 2 + sin(t), or a Y that falls, and ψ = 1: T η̂' = 50 (x/T − η̂), x' = Y − βx."""
@@ -808,7 +808,8 @@ def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta, mor
         memory = -np.expm1(-beta * t) / beta if beta else t
         return [2.0 + more(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
 
-    exact = integrate(rates, [2e-3, 2.0], np.append(1e-3, T))[1:, 1]
+    first = [1e-3 * (2.0 + more(5e-4)), 2.0]
+    exact = integrate(rates, first, np.append(1e-3, T))[1:, 1]
     np.testing.assert_allclose(found, exact, rtol=1e-6)
 
 

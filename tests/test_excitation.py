@@ -167,7 +167,8 @@ def test_an_error_that_falls_within_the_first_step_has_settled_there():
              "C": [[1]], "initial_state": [1]}
     time = {"horizon": 10, "samples": 11}
     case = run(plant, estimator="gradient", gamma=1e3, time=time).cases[0]
-    assert case["seconds_to_1pct_e0_x"] == pytest.approx(np.log(100.0) / 1e3, rel=1e-6)
+    for name in ("e0_x", "x", "parameters", "states"):
+        assert case[f"seconds_to_1pct_{name}"] == pytest.approx(np.log(100.0) / 1e3, rel=1e-6)
 
 
 def test_norms_that_start_at_rounding_have_settled_at_once():
