@@ -318,6 +318,16 @@ def test_a_run_without_any_choice_converges_where_psi_is_exciting(plant):
     assert np.isfinite(result.metrics.seconds_to_1pct_parameters).all()
 
 
+@pytest.mark.parametrize("estimator", ["ls_drem", "least_squares", "gradient"])
+def test_where_nothing_can_be_known_what_is_required_is_not_met(estimator):
+    """y = u: the state and the unknown have no part in it."""
+    plant = one_state(inputs={"u": "sin(t)"}, unknowns={"k": 1}, A=[[-1]], B=[[1]], F=[[1]],
+                      C=[[0]], D=[[1]])
+    said = run(plant, estimator=estimator, time={"horizon": 2.0, "samples": 5}).verdict
+    assert "not determined by the data: x, k, e0_x; " in said
+    assert " not met: " in said
+
+
 def test_check_tells_the_deviation_that_a_run_with_noise_has():
     """Per unit of noise: times σ it is that of least squares in a run."""
     settings = Settings({"name": "least_squares", "f0": 1e-12})
