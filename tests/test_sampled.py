@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
-from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
 from gpebo_cli.experiment.online import Online
@@ -435,6 +435,10 @@ def test_the_monotone_law_at_samples(gain):
     recursion, (_, T, mu, theta) = built.recursive(["e", "f", "g"]), built.law(S)
     with pytest.raises(ConfigError, match="is for a regression with S"):
         built.recursive(["e", "f", "g"]).update(block)
+    beyond = replace(block, parametrisation=S, rows=block.rows.copy())
+    beyond.rows[..., 3] = block.rows[..., :3] @ [-2.0, -99.0, -99.0]  # no √b and no b
+    with pytest.raises(SolverError, match="cannot be followed at samples; lower its gain"):
+        built.recursive(["e", "f", "g"]).update(beyond)
     made = recursion.update(replace(block, parametrisation=S))
     eta = made.parameters  # (a, √b, a + b), from which θ̂ is read off
     found = np.stack([eta[..., 0], eta[..., 1] ** 2], axis=2)
