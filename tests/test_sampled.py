@@ -468,6 +468,28 @@ def test_the_monotone_law_at_samples(gain):
 NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
 
 
+def test_the_power_law_at_samples_needs_what_its_start_is_off():
+    """|e|^½ falls by γ/2 ∫|Δ|^{3/2}, and with twice the needed γ e is zero at the end."""
+    block, eta = regression(K=25), np.array([1.0, -2.0, 3.0])
+    block.rows[..., 3] = block.rows[..., :3] @ eta
+    omega = KreisselmeierFilter(np.ones(3)).update(block)[..., :3]
+    known = np.linalg.cond(omega) < 1e12
+    energy = np.cumsum(known * block.steps * np.abs(np.linalg.det(omega)) ** 1.5)
+    settings = {"name": "power", "lambda": 1.0, "initial": 0.5}
+    needed = 2.0 * np.sqrt(2.5)
+    for share in (0.5, 2.0):
+        gamma = share * needed / energy[-1]
+        recursion = estimators.build(settings | {"gamma": gamma}).recursive(["a", "b", "c"])
+        error = recursion.update(block).parameters[0] - eta
+        left = np.sqrt(np.abs(0.5 - eta)) - 0.5 * gamma * energy[:, None]
+        np.testing.assert_allclose(np.abs(error), np.maximum(left, 0.0) ** 2, atol=1e-9)
+        assert recursion.requirement.holds == (share > 1.0)
+        assert recursion.requirement.evidence == pytest.approx({
+            "integral_delta_squared": energy[-1], "gamma_times_integral": share * needed,
+            "needed": needed,
+        })
+
+
 def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
     assert all(
         isinstance(estimators.build({"name": name}), estimators.Recursive)
