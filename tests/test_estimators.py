@@ -275,7 +275,8 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
         np.testing.assert_allclose(error, left, atol=1e-10)
     requirement = estimate("power", CLEAN, gamma=gamma, alpha=alpha, **rates).requirement
     assert requirement.holds == (left[-1].max() == 0.0)
-    near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=list(ETA - 0.1), **rates)
+    start = [1.1, -2.05, 0.48]
+    near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=start, **rates)
     needed = 0.1 ** (1.0 - alpha) / (1.0 - alpha)
     assert near.requirement.evidence["needed"] == pytest.approx(needed)
 
