@@ -19,6 +19,8 @@ from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.experiment.result import Fit
+from gpebo_cli.experiment.verdict import _explains
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -32,6 +34,8 @@ sys.path.insert(0, str(ROOT / "docs"))
 import uncertainty as page
 
 SEEDS = 300
+WHY = "a missing or wrong parameter, a drifting sensor, or a delay"
+TIMES = " times what the sensors' noise makes"
 ESTIMATORS = (
     {"name": "gradient"}, {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3},
     {"name": "least_squares", "beta": 0.3, "f0": 0.1, "bound": 1e3}, {"name": "ls_drem"},
@@ -277,6 +281,44 @@ def test_gaps_written_as_numbers_and_rounding_are_told(change, told):
     noise = 0.02 if told.startswith("explain") else 0.0
     y = change(clean + noise * np.random.default_rng(3).standard_normal(len(t)))
     assert told in run(plant, data={"t": t, "y": y}).verdict
+
+
+NOTHING = np.zeros(5)
+WHITE = ": the estimates explain the data up to white noise"
+NOT = " is not white (its correlation is "
+FAR = (": some samples are far from what explains the others, 24 of y (first at t = 0.14), which "
+       "suggests gaps that are written as numbers (data.gaps), or a sensor that fails")
+
+
+@pytest.mark.parametrize(("fit", "said"), [
+    ({"least": 0.01}, (", where least squares of the same data leave 0.01: what is left says more "
+                       "of these estimates than of the model")),
+    ({"least": 0.02}, WHITE),
+    ({"residual": [5e-5], "least": 1e-9}, ": the estimates explain the data"),
+    ({"correlation": None}, ""), ({"correlation": None, "ratio": 3.9}, f", 3.90{TIMES}"),
+    ({"correlation": None, "ratio": 4.1}, f", 4.10{TIMES}, which suggests {WHY}"),
+    ({"ratio": 0.05, "slow": True}, f": the residual is far below the noise, 0.05{TIMES}"),
+    ({"ratio": 1.1}, f"{WHITE}, 1.10{TIMES}"),
+    ({"ratio": 1.3}, (f": the residual is white, 1.30{TIMES}, which suggests a noisier sensor than "
+                      "was said")),
+    ({"correlation": [0.0, -0.5, 0.0, 0.0, 0.0]}, WHITE),
+    ({"correlation": [0.1, -0.5, 0.0, 0.3, 0.0], "ratio": 1.0},
+     f": the residual, 1.00{TIMES},{NOT}0.50), which suggests {WHY}"),
+    ({"slow": True}, f": the residual{NOT}0.00, and a part of it is slow), which suggests {WHY}"),
+    ({"follows": True, "in_matrices": ("y", "z")}, (
+        f": the residual{NOT}0.00, and it follows the inputs), which noise of y, z in the matrices "
+        f"does (observer.remedy=noise_free takes it out); or it suggests {WHY}")),
+    ({"slow": True, "rounded": [("y", 0.05)]}, (
+        f": the residual{NOT}0.00, and a part of it is slow), which suggests that it is rounding "
+        f"(y to steps of 0.05), for which deviations are too small, or {WHY}")),
+    ({"far": [("y", 24, 0.14)], "ratio": 2.0}, f"{FAR}, 2.00{TIMES}"),
+    ({"far": [("y", 24, 0.14)], "slow": True},
+     f"{FAR}; without them the residual is not white, which they may have made, or {WHY}"),
+])
+def test_what_a_residual_says_of_the_model(fit, said):
+    """Of five correlations one may be beyond the band of 0.2."""
+    made = {"residual": [0.05], "size": 1.0, "least": 0.05, "correlation": NOTHING, "band": 0.2}
+    assert _explains(Fit(**made | fit), 0) == said
 
 
 def test_at_samples_matrices_may_follow_an_input_without_noise():
