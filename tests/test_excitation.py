@@ -259,11 +259,13 @@ def test_the_last_line_of_a_run_says_what_was_found(rho, said):
 
 
 def test_the_last_line_says_how_much_of_a_recording_is_explained():
-    """Root mean squares over time, here by the trapezoidal rule."""
-    made = run("descriptor", observer="none", time={"samples": 401})
-    noise = 0.05 * np.random.default_rng(1).standard_normal(401)
+    """Root mean squares over time, by the trapezoidal rule, and correlations of 20 lags."""
+    time = {"samples": 201}
+    made = run("descriptor", observer="none", time=time)
+    noise = 0.05 * np.random.default_rng(1).standard_normal(201)
     data = {"t": made.t, **made.inputs, "y": made["y"] + noise}
-    details = run("descriptor", data=data, estimator="ls_drem", gamma=[1.0, 0.01]).details
+    laws = {"name": "ls_drem", "gamma": [1.0, 0.01]}
+    details = run("descriptor", data=data, estimator=laws).details
     r, fit, final = details.regression, details.fit, details.estimation.parameters[:, -1]
     for eta, told in zip((*final, 0.0 * final[0]), (*fit.residual, fit.size), strict=True):
         square = trapezoid(((r.Y - r.psi @ eta) ** 2).sum(axis=1), r.t) / np.ptp(r.t)
@@ -271,3 +273,8 @@ def test_the_last_line_says_how_much_of_a_recording_is_explained():
     assert fit.residual.argmin() == 0
     assert (f"; |Y − ψη̂| with the final estimates is {fit.residual[0]:.2g}, |Y| is {fit.size:.2g} "
             "(root mean squares)") in details.verdict
+    fit = run("descriptor", data=data, estimator=laws, time=time).details.fit
+    left = data["y"] - fit.outputs[:, 0]
+    power = [(left[k:] * left[: len(left) - k]).sum() for k in range(21)]
+    np.testing.assert_allclose(fit.correlation, np.array(power[1:]) / power[0], atol=1e-6)
+    assert (fit.lag, fit.band) == pytest.approx((0.1, 1.96 / np.sqrt(201.0)))
