@@ -891,7 +891,8 @@ def test_a_parameter_has_the_size_with_which_it_alone_would_explain_the_data():
 
 def test_a_stream_says_which_estimates_are_far_from_least_squares():
     slow = {"name": "ls_drem", "gamma": 0.5, "f0": 0.01, "initial": 1e5}
-    signals = gpebo_cli.run("descriptor", observer="none").details.simulation
+    details = gpebo_cli.run("descriptor").details
+    signals, whole = details.simulation, details.excitation
     rows = signals.t, signals.inputs, signals.outputs
     for gamma, warned in ((0.5, True), (10.0, False)):
         online = stream(Settings(
@@ -899,7 +900,12 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
             data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
         online.feed(*rows)
-        assert ("least squares over the same data" in stream_verdict(online)) == warned
+        said, known = stream_verdict(online), online.excitation()
+        assert ("least squares over the same data" in said) == warned
+        assert said.startswith(f"{len(signals.t)} rows, t = 0 to 20; interval-exciting from t = ")
+        assert known.t_c == pytest.approx(whole.t_c, abs=2.0 * signals.t[1])
+        assert known.level == pytest.approx(whole.level, rel=1e-3)
+        assert ", parameters well determined at the end; |Y − ψη̂| with the final" in said
 
 
 @pytest.mark.parametrize("gain", [1e10, 1e24, 1e30])
