@@ -152,6 +152,18 @@ def test_the_sampled_run_tells_what_the_continuous_one_tells():
     assert [a.name for a in ours.assumptions] == [a.name for a in theirs.assumptions]
 
 
+@pytest.mark.parametrize(("hold", "step", "said"), [
+    ("zoh", 0.2, ("; the error of signals that are held between samples falls with "
+                  "observer.sample_time, and faster with observer.hold=linear")),
+    ("linear", 0.5, ("; the error of straight lines between samples falls with "
+                     "observer.sample_time squared")),
+    ("linear", 0.01, " s (alpha = 1, beta = 0)"),
+])
+def test_what_the_hold_costs_is_said_where_it_costs_one_percent(hold, step, said):
+    found = run(shipped("descriptor"), {"name": "ls_drem"}, 10.0, sample_time=step, hold=hold)
+    assert found.verdict.endswith(said)
+
+
 def test_a_gain_at_samples_is_the_one_in_continuous_time():
     auto = {"name": "ls_drem", "gamma": "auto"}
     made = [run(shipped("boost"), auto, 3.0, **observer) for observer in (
