@@ -181,7 +181,8 @@ def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):
     ({"bounds": {"states": {"h1": [1, 0]}}}, "expected [low, high]"),
     ({"bounds": {"unknowns": {"leak": [1]}}}, "expected [low, high]"),
     ({"bounds": {"unknown": {"leak": [1, 2]}}}, "accepted: states, unknowns"),
-    ({"bounds": {"states": {"h2": [5, 6], "h1": [0, 1]}}}, "no estimate respects those of h2, h1"),
+    ({"bounds": {"states": {"h2": [5, 6], "h1": [0, 1]}}},
+     "no estimate respects those of h2, h1 together with the data up to t = 2"),
     ({"bounds": BOUNDS, "sample_time": 0.1}, "continuous time only"),
     ({"bounds": BOUNDS, "remedy": "reset"}, "accepted remedies"),
 ])
