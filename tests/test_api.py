@@ -437,3 +437,15 @@ def test_a_loop_tells_which_share_of_it_is_done():
     for done in (1, 4):
         loop(done)
     assert shares == [0.25, 1.0]
+
+
+def test_a_loop_is_refused_by_how_long_it_took_so_far(monkeypatch):
+    """Not within its first second, and not when all of it is done."""
+    clock = iter([10.0, 10.9, 15.0, 99.0])
+    monkeypatch.setattr("gpebo_cli.experiment.limits.process_time", clock.__next__)
+    loop = paced(10, "cases", 4.0, lambda _: None)
+    loop(1)
+    with refused("10 cases would take some 25 s of computing time (the first 2 took 5.0 s), and a "
+                 "run may take 4 s; to wait for them: solver.max_seconds=50"):
+        loop(2)
+    loop(10)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import one_state, shipped
+from plants import one_state, reference, shipped
 from processes import printed
 
 from gpebo_cli import run
@@ -31,7 +31,11 @@ def test_the_circuit_satisfies_everything():
     assert all(a.holds for a in names.values())
     assert names["Solvability"].evidence["index"] == 2
     assert names["Solvability"].evidence["strangeness_index"] == 1
-    assert names["Assumption 2"].evidence["t_c"] > 0
+    assert names["Consistent start"].evidence["largest_change"] == pytest.approx(3.2)  # iv falls
+    excitation = names["Assumption 2"].evidence
+    values = np.array(reference("circuit")["at"][-1]["gram_eigenvalues"])
+    assert excitation["t_c"] > 0
+    assert excitation["lambda_min"] == pytest.approx(values[0], rel=1e-6)
     assert "Regularity" not in names  # a notion for constant coefficients
 
 
@@ -68,8 +72,10 @@ def test_constant_coefficients_get_regularity_and_the_rank_condition():
     names = found(lti())
     assert names["Regularity"].holds
     assert names["Rank condition D2"].holds
+    assert names["Rank condition D2"].evidence == {"rank": 3, "needed": 3}
     blind = found(lti(A=[[-1, 1], [1, 0]]), form="given")  # neither A22 nor C sees v
     assert not blind["Rank condition D2"].holds
+    assert blind["Rank condition D2"].evidence == {"rank": 2, "needed": 3}
     assert not blind["Assumption 1"].holds
 
 
@@ -98,6 +104,8 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert not names["Growth of Φ"].holds
     assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
     falls = plant_from_mapping(one_state(A=[[-1]]))
+    # Of λ at roots of one that of λ + 1 which is largest, at λ = 1.
+    assert found(falls)["Regularity"].evidence["largest_smallest_singular_value"] == 2.0
     assert found(falls)["Growth of Φ"].evidence["rate"] == pytest.approx(-1.0, rel=1e-9)
     short = run(falls, observer={"name": "gpebo", "sample_time": 0.1}, time={"horizon": 0.5})
     (at_samples,) = [each for each in short.details.assumptions if each.name == "Growth of Φ"]

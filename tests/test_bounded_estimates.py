@@ -7,7 +7,8 @@ import json
 import clarabel
 import numpy as np
 import pytest
-from processes import refused
+from plants import one_state
+from processes import refused, write_table
 from scipy import sparse
 from scipy.linalg import expm
 from scipy.optimize import brentq
@@ -180,7 +181,8 @@ def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):
     ({"bounds": {"states": {"h1": [1, 0]}}}, "expected [low, high]"),
     ({"bounds": {"unknowns": {"leak": [1]}}}, "expected [low, high]"),
     ({"bounds": {"unknown": {"leak": [1, 2]}}}, "accepted: states, unknowns"),
-    ({"bounds": {"states": {"h2": [5, 6], "h1": [0, 1]}}}, "no estimate respects those of h2, h1"),
+    ({"bounds": {"states": {"h2": [5, 6], "h1": [0, 1]}}},
+     "no estimate respects those of h2, h1 together with the data up to t = 2"),
     ({"bounds": BOUNDS, "sample_time": 0.1}, "continuous time only"),
     ({"bounds": BOUNDS, "remedy": "reset"}, "accepted remedies"),
 ])
@@ -212,6 +214,27 @@ def test_a_long_recording_respects_bounds_in_all_of_its_rows(follows, monkeypatc
         moved = np.abs(free.estimates[name][0] - expected).max()
         assert np.abs(found.estimates[name][0] - expected).max() < 1e-3 * moved
     assert "held by bounds: h1" in found.verdict
+
+
+def test_bounds_hold_at_every_row_of_several_long_files(tmp_path):
+    """At few times of the output the state is known at the rows, at many at all points."""
+    plant = one_state(inputs={"u": "sin(t)"}, unknowns={"leak": 0.3}, A=[[-0.5]], B=[[1]], F=[[-1]])
+    files = []
+    for k, start in enumerate((1.0, 3.0)):
+        made = run({**plant, "initial_state": {"x": 1.0 - k}}, observer="none",
+                   time={"start": start, "horizon": 4.0, "samples": 101})
+        y = made["y"] + 0.1 * np.random.default_rng(k).standard_normal(101)
+        files.append(write_table(tmp_path / f"{k}.csv", {"t": made.t, "u": made["u"], "y": y}))
+    low = {"states": {"x": [-0.7, None]}}
+    few, many = (
+        run(plant, data={"file": files, "hold": "zoh"}, estimator="least_squares",
+            time={"samples": samples}, observer={"bounds": low}).details.estimation
+        for samples in (5, 17)
+    )
+    assert few.states[0, :, 0].min() >= -0.7 - 1e-9
+    (one,), (other,) = few.active[0], many.active[0]
+    assert one.time == pytest.approx(other.time) == pytest.approx(7.68)
+    np.testing.assert_allclose(few.parameters[0, -1], many.parameters[0, -1], atol=1e-3)
 
 
 def test_bounds_on_what_has_forgotten_its_start_move_no_estimate():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
-from scipy.integrate import trapezoid
+from scipy.integrate import quad_vec, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
@@ -25,6 +25,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
+from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -274,7 +275,8 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
         np.testing.assert_allclose(error, left, atol=1e-10)
     requirement = estimate("power", CLEAN, gamma=gamma, alpha=alpha, **rates).requirement
     assert requirement.holds == (left[-1].max() == 0.0)
-    near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=list(ETA - 0.1), **rates)
+    start = [1.1, -2.05, 0.48]
+    near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=start, **rates)
     needed = 0.1 ** (1.0 - alpha) / (1.0 - alpha)
     assert near.requirement.evidence["needed"] == pytest.approx(needed)
 
@@ -601,6 +603,39 @@ def test_a_gain_that_is_auto_settles_before_the_end(name):
     assert not estimate(name, CLEAN, gamma=0.5 * least).requirement.holds
 
 
+@pytest.mark.parametrize("beta", [0.0, 0.4])
+def test_least_squares_needs_the_weakest_direction_to_outweigh_the_prior(beta):
+    """α λ_min(G)/(z f₀) by quadrature, of the case that has the least of it."""
+    G = quad_vec(lambda s: np.exp(-beta * (10.0 - s)) * np.outer(three(s), three(s)), 0.0, 10.0)[0]
+    least = np.linalg.eigvalsh(G)[0] / np.exp(-10.0 * beta)
+    cases = {"alpha": [0.5, 2.0], "f0": [1e-4, 1e-3], "beta": beta}
+    reached = estimate("least_squares", CLEAN, **cases).requirement.evidence
+    assert reached["alpha_lambda_min_over_f0"] == pytest.approx(0.5 * least / 1e-3, rel=1e-9)
+    for share, holds in ((1.01, True), (0.99, False)):
+        gains = {"alpha": 2.0, "f0": 2.0 * least / (share * 99.0), "beta": beta}
+        said = estimate("least_squares", CLEAN, **gains).requirement
+        assert said.holds == holds
+        assert f"is {share * 99.0:.3g} times f₀; 1 % of the initial error needs 99" in said.text
+
+
+@pytest.mark.parametrize(("gamma", "first", "segment"), [
+    (10.0, 6.0, 1), (3.0, 1.0, 2), (0.1, 6.0, 3),
+])
+def test_what_is_required_is_that_of_the_first_segment_that_has_it(gamma, first, segment):
+    """Or of the last one, where none has; the first one has it as a run until then."""
+    def required(horizon, **observer):
+        return gpebo_cli.run(
+            "descriptor", estimator={"name": "ls_drem", "gamma": gamma, "f0": 1e-3},
+            observer={"name": "gpebo", **observer}, time={"horizon": horizon, "samples": 11},
+        ).details.estimation.requirement
+
+    found = required(20.0, remedy="reset", reset_times=[first, 14.0])
+    assert found.text.startswith(f"in segment {segment} of the 3 between resets, γ∫Δ² = ")
+    assert found.holds == (segment < 3)
+    if segment == 1:
+        assert found.evidence == pytest.approx(required(6.0).evidence, rel=1e-6)
+
+
 def test_a_gain_that_is_auto_is_not_for_samples():
     with pytest.raises(ConfigError, match="auto needs to know the signals to their end"):
         estimators.build({"name": "drem", "gamma": "auto"}).recursive(["a"])
@@ -653,7 +688,9 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "drem", "gamma": -1}, "positive number"),
         ({"name": "drem", "gamma": []}, "empty list"),
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
-        ({"name": "drem", "gamma": "logspace(0, 400, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "logspace(0, -301, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "logspace(0, 1, 2.5)"}, "whole number of values"),
         ({"name": "drem", "gamma": "import os"}, "not a positive number"),
         ({"name": "drem", "gamma": float("nan")}, "positive number"),
         ({"name": "drem", "gama": 1}, "gama"),
@@ -759,18 +796,21 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
 
 
-@pytest.mark.parametrize("beta", [0.0, 0.4])
-def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta):
-    """Of Y = 2 + sin(t) and ψ = 1: T η̂' = 50 (x/T − η̂), where x' = Y − βx is the memory."""
+@pytest.mark.parametrize(("beta", "more"), [
+    (0.0, np.sin), (0.4, np.sin), (0.0, lambda t: 2.0 * np.expm1(-3.0 * t)),
+])
+def test_the_gain_that_nobody_set_is_one_over_the_length_of_the_memory(beta, more):
+    """Of Y = 2 + sin(t), or a Y that falls, and ψ = 1: T η̂' = 50 (x/T − η̂), x' = Y − βx."""
     T = np.linspace(0.5, 6.0, 12)
-    signal = regression(lambda t: np.ones((*t.shape, 1)), np.array([2.0]), 6.0, disturbance=np.sin)
+    signal = regression(lambda t: np.ones((*t.shape, 1)), np.array([2.0]), 6.0, disturbance=more)
     found = estimate("ls_drem", signal, T, beta=beta).parameters(slice(None))[0, :, 0]
 
     def rates(t, x):
         memory = -np.expm1(-beta * t) / beta if beta else t
-        return [2.0 + np.sin(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
+        return [2.0 + more(t) - beta * x[0], 50.0 / memory * (x[0] / memory - x[1])]
 
-    exact = integrate(rates, [2e-3, 2.0], np.append(1e-3, T))[1:, 1]
+    first = [1e-3 * (2.0 + more(5e-4)), 2.0]
+    exact = integrate(rates, first, np.append(1e-3, T))[1:, 1]
     np.testing.assert_allclose(found, exact, rtol=1e-6)
 
 
@@ -836,9 +876,23 @@ def test_how_far_estimates_may_be_off_is_how_far_they_are(observer, name, small,
     assert told
 
 
+def test_a_parameter_has_the_size_with_which_it_alone_would_explain_the_data():
+    """√(∫Y²/∫ψ_j²) by quadrature; a zero one is compared with that, and no other one is."""
+    *squares, of_Y = quad_vec(
+        lambda s: np.append(three(s) ** 2, (three(s) @ ETA + wobble(s)) ** 2), 0.0, 10.0
+    )[0]
+    natural = accuracy.natural_sizes(NOISY, 3)
+    np.testing.assert_allclose(natural, np.sqrt(of_Y / squares), rtol=1e-9)
+    assert not accuracy.natural_sizes(NOISY, 5).any()
+    truth = np.array([[0.0, 1e-3, -2.0], [0.0, -2e-3, 1.0]])
+    sizes, _ = accuracy.sizes_of(truth, natural, truth)
+    np.testing.assert_array_equal(sizes, [natural[0], 2e-3, 2.0])
+
+
 def test_a_stream_says_which_estimates_are_far_from_least_squares():
     slow = {"name": "ls_drem", "gamma": 0.5, "f0": 0.01, "initial": 1e5}
-    signals = gpebo_cli.run("descriptor", observer="none").details.simulation
+    details = gpebo_cli.run("descriptor").details
+    signals, whole = details.simulation, details.excitation
     rows = signals.t, signals.inputs, signals.outputs
     for gamma, warned in ((0.5, True), (10.0, False)):
         online = stream(Settings(
@@ -846,7 +900,12 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
             data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
         online.feed(*rows)
-        assert ("least squares over the same data" in stream_verdict(online)) == warned
+        said, known = stream_verdict(online), online.excitation()
+        assert ("least squares over the same data" in said) == warned
+        assert said.startswith(f"{len(signals.t)} rows, t = 0 to 20; interval-exciting from t = ")
+        assert known.t_c == pytest.approx(whole.t_c, abs=2.0 * signals.t[1])
+        assert known.level == pytest.approx(whole.level, rel=1e-3)
+        assert ", parameters well determined at the end; |Y − ψη̂| with the final" in said
 
 
 @pytest.mark.parametrize("gain", [1e10, 1e24, 1e30])

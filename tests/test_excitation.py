@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
-from scipy.integrate import quad_vec
+from scipy.integrate import quad_vec, trapezoid
 from scipy.optimize import brentq
 
 from gpebo_cli import run
@@ -49,6 +50,11 @@ def test_eigenvalues_and_window_against_quadrature():
             found.gram_eigenvalues[k], np.linalg.eigvalsh(gram(three, 0, T[k])), atol=1e-11
         )
     assert found.lambda_min == pytest.approx(found.gram_eigenvalues[200, 0], rel=1e-12)
+    G = gram(three, 0, 10.0)
+    values, vectors = np.linalg.eigh(G / np.sqrt(np.outer(*[np.diag(G)] * 2)))
+    assert (found.level, found.condition) == pytest.approx((values[0], values[-1] / values[0]))
+    weakest = vectors[:, 0] * np.sign(vectors[np.abs(vectors[:, 0]).argmax(), 0])
+    assert list(found.weakest_direction.components.values()) == pytest.approx(weakest)
     assert np.isnan(found.pe_level[T < 2.5]).all()
     for k in (50, 111, 200):
         expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
@@ -125,6 +131,21 @@ def test_a_fading_regressor_is_ie_and_not_pe():
     assert not persistent(outer(CLEAN), 1e-3).holds
 
 
+def test_a_gain_is_enough_by_the_window_that_has_least():
+    """Windows of a tenth of the horizon, which begin at hundredths of it, by quadrature."""
+    cuts = np.linspace(0.0, 10.0, 101)
+    parts = np.array([gram(three, *ends) for ends in pairwise(cuts)])
+    level = min(np.linalg.eigvalsh(parts[k : k + 10].sum(axis=0))[0] for k in range(91))
+    for share, holds in ((1.01, True), (0.99, False)):
+        gain = share * np.log(100.0) / 10.0 / level
+        found = persistent(outer(CLEAN), gain)
+        assert found.holds == holds
+        assert found.evidence == pytest.approx({
+            "pe_level": level, "window": 1.0, "gamma_times_level": gain * level,
+            "needed": np.log(100.0) / 10.0,
+        }, rel=1e-8)
+
+
 def test_settling_time_of_an_exponential_is_exact():
     t = np.linspace(2.0, 12.0, 37)
     error = np.array([np.exp(-0.8 * (t - 2.0)), np.ones_like(t), np.zeros_like(t)])
@@ -146,7 +167,8 @@ def test_an_error_that_falls_within_the_first_step_has_settled_there():
              "C": [[1]], "initial_state": [1]}
     time = {"horizon": 10, "samples": 11}
     case = run(plant, estimator="gradient", gamma=1e3, time=time).cases[0]
-    assert case["seconds_to_1pct_e0_x"] == pytest.approx(np.log(100.0) / 1e3, rel=1e-6)
+    for name in ("e0_x", "x", "parameters", "states"):
+        assert case[f"seconds_to_1pct_{name}"] == pytest.approx(np.log(100.0) / 1e3, rel=1e-6)
 
 
 def test_norms_that_start_at_rounding_have_settled_at_once():
@@ -164,6 +186,30 @@ def test_norms_that_start_at_rounding_have_settled_at_once():
         t, (squares, squares), unknown, np.zeros((2, 1)), np.ones(1, dtype=bool)
     )
     assert np.isnan(found[[0, 2]]).all()
+
+
+def test_metrics_are_those_of_the_errors_of_parameters_and_states():
+    """Each in units of its size where they are added up; times to within 5 ms."""
+    time = {"horizon": 4.0, "samples": 801}
+    details = run("descriptor", estimator="ls_drem", gamma=[30.0, 90.0], time=time).details
+    found, of, x = details.metrics, details.estimation, details.simulation.states
+    assert len(of.t) == 801
+    errors = [of.parameters - of.true_parameters, of.states - x]
+    sizes = [np.abs(of.true_parameters).max(axis=0), np.abs(x).max(axis=0)]
+    squares = [((e / size) ** 2).sum(axis=2) for e, size in zip(errors, sizes, strict=True)]
+    rms = np.sqrt(trapezoid(squares[1], of.t, axis=1) / 4.0)
+    np.testing.assert_allclose(found.rms_error_states, rms, rtol=0.01)
+    names = (*of.names, *details.system.states)
+    each = np.concatenate(errors, axis=2) ** 2
+    told = [found.seconds_to_1pct_parameters, found.seconds_to_1pct_states,
+            *(found.seconds_to_1pct[name] for name in names)]
+    for seconds, values in zip(told, [*squares, *np.moveaxis(each, 2, 0)], strict=True):
+        above = values > 1e-4 * values[:, :1]
+        last = [of.t[row.nonzero()[0][-1]] for row in above]
+        np.testing.assert_allclose(seconds, last, atol=0.005 + 1e-9)
+    for final, error in zip((found.final_error_parameters, found.final_error_states), errors,
+                            strict=True):
+        np.testing.assert_allclose(final, np.abs(error[:, -1]).max(axis=1), rtol=1e-6)
 
 
 def test_time_rms():
@@ -185,3 +231,50 @@ def test_sizes_of_terms_are_those_of_the_element_of_each_time():
     scale = np.arange(12.0).reshape(4, 3)
     made = replace(regression(three, ETA, elements=4), scale=scale)
     assert (made.terms(np.array([1.0, 4.0, 6.0, 9.0])) == scale).all()
+
+
+@pytest.mark.parametrize(("rho", "said"), [
+    (None, "interval-exciting from t = {0.t_c:.4g} s on (λ_min(G) = {0.level:.3g} with unit diag"),
+    (0.01, "interval-exciting from t = {0.t_c:.4g} s on (λ_min(G) = {0.lambda_min:.3g}, ρ = 0.01"),
+    (0.5, "NOT interval-exciting: λ_min(G) = {0.lambda_min:.3g}, ρ = 0.5; not excited: "),
+])
+def test_the_last_line_of_a_run_says_what_was_found(rho, said):
+    """Of the case whose state error falls below 1 % first."""
+    given = {"excitation": {"rho": rho}, "time": {"samples": 81}}
+    details = run("descriptor", estimator="ls_drem", gamma=[1.0, 5.0], **given).details
+    found, error = details.metrics, np.abs(details.estimation.states - details.simulation.states)
+    assert details.verdict.startswith(said.format(details.excitation))
+    more = ("not excited: {0.weakest_direction}" if rho == 0.5 else
+            "), parameters well determined from t = {0.determined:.4g} s on")
+    assert details.verdict.endswith(more.format(details.excitation) + (
+        f"; state error {error[1, -1].max():.2g} at the end, below 1 % after "
+        f"{found.seconds_to_1pct_states[1]:.4g} s (alpha = 1, f0 = 0.0001, beta = 0, gamma = 5)"
+    ))
+    slow = run("descriptor", estimator="gradient", gamma=[1e-3, 1e-2], **given).details
+    error = np.abs(slow.estimation.states[:, -1] - slow.simulation.states[-1]).max(axis=1)
+    case = int(error.argmin())
+    assert (f"state error {error[case]:.2g} at the end, never below 1 % "
+            f"(gamma = {slow.estimation.cases[case]['gamma']:g}); PE not met: ") in slow.verdict
+    assert ", times γ = 0.001 is " in slow.verdict
+
+
+def test_the_last_line_says_how_much_of_a_recording_is_explained():
+    """Root mean squares over time, by the trapezoidal rule, and correlations of 20 lags."""
+    time = {"samples": 201}
+    made = run("descriptor", observer="none", time=time)
+    noise = 0.05 * np.random.default_rng(1).standard_normal(201)
+    data = {"t": made.t, **made.inputs, "y": made["y"] + noise}
+    laws = {"name": "ls_drem", "gamma": [1.0, 0.01]}
+    details = run("descriptor", data=data, estimator=laws).details
+    r, fit, final = details.regression, details.fit, details.estimation.parameters[:, -1]
+    for eta, told in zip((*final, 0.0 * final[0]), (*fit.residual, fit.size), strict=True):
+        square = trapezoid(((r.Y - r.psi @ eta) ** 2).sum(axis=1), r.t) / np.ptp(r.t)
+        assert told == pytest.approx(np.sqrt(square), rel=0.02)
+    assert fit.residual.argmin() == 0
+    assert (f"; |Y − ψη̂| with the final estimates is {fit.residual[0]:.2g}, |Y| is {fit.size:.2g} "
+            "(root mean squares)") in details.verdict
+    fit = run("descriptor", data=data, estimator=laws, time=time).details.fit
+    left = data["y"] - fit.outputs[:, 0]
+    power = [(left[k:] * left[: len(left) - k]).sum() for k in range(21)]
+    np.testing.assert_allclose(fit.correlation, np.array(power[1:]) / power[0], atol=1e-6)
+    assert (fit.lag, fit.band) == pytest.approx((0.1, 1.96 / np.sqrt(201.0)))

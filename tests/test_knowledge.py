@@ -13,7 +13,7 @@ from examples import gpebo
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import one_state, shipped
-from processes import assert_refused, printed, rows_of, write_table
+from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
 from gpebo_cli import run
@@ -23,7 +23,7 @@ from gpebo_cli.experiment.sensors import _fall, _Found, candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results import style
 from gpebo_cli.results.figures import describe
-from gpebo_cli.settings import Settings, TimeSettings
+from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 
 # The last ones: an A_0 that hides something or leaves no digits, columns that are rounding, and
@@ -257,6 +257,23 @@ def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say(plant_name,
     assert all(np.diff([s.log_det for s in tried[:count]]) > 0.0)
 
 
+def test_a_state_that_is_known_without_outputs_has_no_part_in_how_deviations_fall():
+    """w = u: of y = a once more all other deviations fall by √2, and w itself tells nothing."""
+    plant = {
+        "name": "given", "states": ["a", "w"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 0], [0, 1]], "B": [[1], [-1]], "C": [[1, 0]],
+        "initial_state": [1, 0],
+    }
+    found = candidates(Settings({}, TimeSettings(horizon=5.0)), plant_from_mapping(plant))
+    assert [sensor.state for sensor in found] == ["a", "w"]
+    falls = [(sensor.fall, sensor.fall_together) for sensor in found]
+    np.testing.assert_allclose(falls, np.sqrt([[2.0, 2.0], [1.0, 2.0]]), rtol=1e-9)
+    assert [sensor.gained for sensor in found] == [(), ()]
+    for other in (Settings({}, observer={"name": "none"}), Settings({}, data=DataSettings("csv"))):
+        with refused("sensors=all needs a simulation of a plant"):
+            candidates(other, plant_from_mapping(plant))
+
+
 def test_only_all_sensors_can_be_asked_for(half_seen):
     done = gpebo("check", "plant=circuit", "sensors=il", cwd=half_seen)
     assert_refused(done, "sensors=il: the only choice is sensors=all")
@@ -299,6 +316,16 @@ def test_a_run_without_any_choice_converges_where_psi_is_exciting(plant):
     result = run(plant).details
     assert result.excitation.is_ie
     assert np.isfinite(result.metrics.seconds_to_1pct_parameters).all()
+
+
+@pytest.mark.parametrize("estimator", ["ls_drem", "least_squares", "gradient"])
+def test_where_nothing_can_be_known_what_is_required_is_not_met(estimator):
+    """y = u: the state and the unknown have no part in it."""
+    plant = one_state(inputs={"u": "sin(t)"}, unknowns={"k": 1}, A=[[-1]], B=[[1]], F=[[1]],
+                      C=[[0]], D=[[1]])
+    said = run(plant, estimator=estimator, time={"horizon": 2.0, "samples": 5}).verdict
+    assert "not determined by the data: x, k, e0_x; " in said
+    assert " not met: " in said
 
 
 def test_check_tells_the_deviation_that_a_run_with_noise_has():

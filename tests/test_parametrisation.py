@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from processes import refused
 from regressions import adjugate, integrate
+from scipy.integrate import trapezoid
 from scipy.optimize import least_squares
 
 from gpebo_cli import ConfigError, estimators, run
@@ -185,8 +186,18 @@ def test_the_monotone_gradient_against_an_integration_of_its_odes():
         ])
 
     expected = integrate(f, np.concatenate([np.zeros(20), [2.55, 1.55]]), t)[:, 20:]
-    eta = estimators.build(MONOTONE).estimate(made, t).parameters(slice(None))[0]
+    found = estimators.build(MONOTONE).estimate(made, t)
+    eta = found.parameters(slice(None))[0]
     np.testing.assert_allclose(eta, S(expected), atol=1e-9)
+    fine = np.linspace(0.0, 6.0, 6001)
+    energy = trapezoid(found.delta(fine)[0] ** 2, fine)
+    assert found.requirement.evidence == pytest.approx({
+        "integral_delta_squared": energy, "gamma_times_integral": 3e3 * energy,
+        "needed": np.log(100.0),
+    }, rel=1e-5)
+    twice = estimators.build(MONOTONE | {"T": (2.0 * np.array(IDENTITY)).tolist()})
+    needed = twice.estimate(made, t).requirement.evidence["needed"]
+    assert needed == pytest.approx(np.log(100.0) / 2.0, rel=0.02)  # of which μ is a lower bound
     # ... and what is reported for θ is that θ, also before anything is exciting.
     weight = made.gram(t)[..., :4]
     np.testing.assert_allclose(made.parametrisation.fitted(eta, weight), expected, atol=1e-6)

@@ -82,6 +82,22 @@ def canonical(**changes):
             "observer.unknown_initial: with this remedy the parameters are about later states",
         ),
         (
+            {"time": {"start": 1.0, "horizon": 2.0}, "observer": {"sample_time": 2.5}},
+            "observer.sample_time = 2.5 is longer than the horizon of 2 s",
+        ),
+        (
+            {"time": {"start": 1.0, "horizon": 2.0}, "observer": {"sample_time": 1.999e-6}},
+            "observer.sample_time = 1.999e-06 makes 1000500 samples; at most 1000000",
+        ),
+        (
+            {"noise": {"name": "gaussian", "outputs": 0.1, "sample_time": 1e-5}},
+            "noise.sample_time = 1e-05 s makes 2e+06 samples over 20 s, and each needs an element",
+        ),
+        (
+            {"estimator": {"name": "least_squares", "f0": None, "bound": 0.5}},
+            "estimator.bound = 0.5 is one of the covariance, which starts at 1/f0: give",
+        ),
+        (
             {"noise": {"name": "gaussian", "outputs": 0.1, "sample_time": 1e-3, "seeds": 101}},
             "noise.seeds = 101: with noise.sample_time = 0.001 s they have 2.02e+06 samples",
         ),

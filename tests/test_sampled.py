@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
-from gpebo_cli.errors import ConfigError, ModelError
+from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
 from gpebo_cli.experiment.online import Online
@@ -152,6 +152,18 @@ def test_the_sampled_run_tells_what_the_continuous_one_tells():
     assert [a.name for a in ours.assumptions] == [a.name for a in theirs.assumptions]
 
 
+@pytest.mark.parametrize(("hold", "step", "said"), [
+    ("zoh", 0.2, ("; the error of signals that are held between samples falls with "
+                  "observer.sample_time, and faster with observer.hold=linear")),
+    ("linear", 0.5, ("; the error of straight lines between samples falls with "
+                     "observer.sample_time squared")),
+    ("linear", 0.01, " s (alpha = 1, beta = 0)"),
+])
+def test_what_the_hold_costs_is_said_where_it_costs_one_percent(hold, step, said):
+    found = run(shipped("descriptor"), {"name": "ls_drem"}, 10.0, sample_time=step, hold=hold)
+    assert found.verdict.endswith(said)
+
+
 def test_a_gain_at_samples_is_the_one_in_continuous_time():
     auto = {"name": "ls_drem", "gamma": "auto"}
     made = [run(shipped("boost"), auto, 3.0, **observer) for observer in (
@@ -263,6 +275,9 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     left = np.concatenate([rows[..., :3].reshape(-1, 3), prior * np.eye(3)])
     right = np.concatenate([rows[..., 3].ravel(), prior * np.full(3, 0.7)])
     np.testing.assert_allclose(estimate, np.linalg.lstsq(left, right, rcond=None)[0], rtol=1e-11)
+    squares = np.linalg.eigvalsh(np.einsum("kri,krj->ij", rows[..., :3], rows[..., :3]))
+    reached = recursion.requirement.evidence["alpha_lambda_min_over_f0"]
+    assert reached == pytest.approx(squares[0] / prior**2, rel=1e-9)
 
 
 def test_the_square_root_form_survives_what_normal_equations_do_not():
@@ -274,6 +289,9 @@ def test_the_square_root_form_survives_what_normal_equations_do_not():
     quotient, usable, _ = quotient_of(spectrum(roots[:, 0], memory[:, 0]))
     assert usable[-1]
     np.testing.assert_allclose(quotient[-1], eta, atol=1e-5)
+    small = quotient_of(spectrum(1e-20 * roots[:, 0], memory[:, 0]))  # in other units of Y
+    np.testing.assert_array_equal(small[1], usable)
+    np.testing.assert_allclose(small[0], quotient, rtol=1e-4)
     rows = block.weighted().reshape(-1, 3)
     normal = rows.T @ rows  # its condition is 1e18
     assert np.linalg.eigvalsh(normal[:2, :2])[0] < 1e-15 * normal[0, 0]
@@ -313,7 +331,13 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     block.rows[20:] = regression(K=20, r=3, hold="linear").rows
     part = replace(block, t=block.t[19:], steps=block.steps[19:], rows=block.rows[19:])
     own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
-    np.testing.assert_array_equal(own.update(block)[19:], late.update(part))
+    whole = own.update(block)
+    np.testing.assert_array_equal(whole[19:], late.update(part))
+    own, found = estimators.build({"name": "lion"}).at_samples(rates), []
+    for a, b in pairwise([0, 1, 10, 25, 40]):
+        rows = block.rows[a : b + 1]
+        found.append(own.update(replace(block, t=block.t[a:b], steps=block.steps[a:b], rows=rows)))
+    np.testing.assert_allclose(np.concatenate(found), whole, atol=1e-13)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
@@ -420,16 +444,24 @@ def test_the_monotone_law_at_samples(gain):
     block, truth = regression(K=25, steps=RNG.uniform(0.02, 0.05, 25)), np.array([-2.0, 8.0])
     block.rows[..., 3] = block.rows[..., :3] @ S.values(truth[None])[0]
     built = estimators.build({"name": "monotone", "gamma": gain, "lambda": 1.0})
-    recursion, (_, T, _, theta) = built.recursive(["e", "f", "g"]), built.law(S)
+    recursion, (_, T, mu, theta) = built.recursive(["e", "f", "g"]), built.law(S)
     with pytest.raises(ConfigError, match="is for a regression with S"):
         built.recursive(["e", "f", "g"]).update(block)
+    beyond = replace(block, parametrisation=S, rows=block.rows.copy())
+    beyond.rows[..., 3] = block.rows[..., :3] @ [-2.0, -99.0, -99.0]  # no √b and no b
+    with pytest.raises(SolverError, match="cannot be followed at samples; lower its gain"):
+        built.recursive(["e", "f", "g"]).update(beyond)
     made = recursion.update(replace(block, parametrisation=S))
     eta = made.parameters  # (a, √b, a + b), from which θ̂ is read off
     found = np.stack([eta[..., 0], eta[..., 1] ** 2], axis=2)
     assert (np.diff(np.linalg.norm(found - truth, axis=2), axis=1) <= 1e-9).all()
-    assert recursion.requirement.evidence["integral_delta_squared"] > 0.0
+    extended = KreisselmeierFilter(np.ones(3)).update(block)
+    energy = block.steps @ np.linalg.det(extended[..., :3]) ** 2
+    assert recursion.requirement.evidence == pytest.approx({
+        "integral_delta_squared": energy, "gamma_times_integral": np.min(gain) * energy,
+        "needed": np.log(100.0) / mu,
+    }, rel=1e-9)
     if gain == 5.0:
-        extended = KreisselmeierFilter(np.ones(3)).update(block)
         for k, omega in enumerate(extended[..., :3]):
             x = gain * np.linalg.det(omega) ** 2 * block.steps[k]
             flow = solve_ivp(
@@ -446,6 +478,28 @@ def test_the_monotone_law_at_samples(gain):
 
 
 NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
+
+
+def test_the_power_law_at_samples_needs_what_its_start_is_off():
+    """|e|^½ falls by γ/2 ∫|Δ|^{3/2}, and with twice the needed γ e is zero at the end."""
+    block, eta = regression(K=25), np.array([1.0, -2.0, 2.0])
+    block.rows[..., 3] = block.rows[..., :3] @ eta
+    omega = KreisselmeierFilter(np.ones(3)).update(block)[..., :3]
+    known = np.linalg.cond(omega) < 1e12
+    energy = np.cumsum(known * block.steps * np.abs(np.linalg.det(omega)) ** 1.5)
+    settings = {"name": "power", "lambda": 1.0, "initial": 0.5}
+    needed = 2.0 * np.sqrt(2.5)
+    for share in (0.5, 2.0):
+        gamma = share * needed / energy[-1]
+        recursion = estimators.build(settings | {"gamma": gamma}).recursive(["a", "b", "c"])
+        error = recursion.update(block).parameters[0] - eta
+        left = np.sqrt(np.abs(0.5 - eta)) - 0.5 * gamma * energy[:, None]
+        np.testing.assert_allclose(np.abs(error), np.maximum(left, 0.0) ** 2, atol=1e-9)
+        assert recursion.requirement.holds == (share > 1.0)
+        assert recursion.requirement.evidence == pytest.approx({
+            "integral_delta_squared": energy[-1], "gamma_times_integral": share * needed,
+            "needed": needed,
+        })
 
 
 def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():

@@ -19,6 +19,8 @@ from gpebo_cli.evidence.metrics import settling_times
 from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
+from gpebo_cli.experiment.result import Fit
+from gpebo_cli.experiment.verdict import _explains
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
@@ -32,6 +34,8 @@ sys.path.insert(0, str(ROOT / "docs"))
 import uncertainty as page
 
 SEEDS = 300
+WHY = "a missing or wrong parameter, a drifting sensor, or a delay"
+TIMES = " times what the sensors' noise makes"
 ESTIMATORS = (
     {"name": "gradient"}, {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3},
     {"name": "least_squares", "beta": 0.3, "f0": 0.1, "bound": 1e3}, {"name": "ls_drem"},
@@ -94,12 +98,14 @@ def test_an_estimate_that_follows_samples_at_once_does_so_between_them(rate):
 def test_the_level_is_that_of_the_residual_less_what_the_fit_takes():
     """White samples around a constant: σ² is Σ(y − mean)²/(N − 1), which has no bias."""
     sample = np.random.default_rng(3).normal(2.0, 0.3, 5)
-    regression = LinearRegression.from_functions(
-        lambda t: np.ones((*t.shape, 1, 1)),
+    regression, small = (LinearRegression.from_functions(
+        lambda t, size=size: np.full((*t.shape, 1, 1), size),
         lambda t: np.repeat(sample, t.shape[1]).reshape(*t.shape, 1), ["a"], 5.0, 5,
-    )
-    level = noise_level(directly, regression, Rows(np.linspace(0.0, 5.0, 6)), np.ones(1))
-    assert level == pytest.approx(np.std(sample, ddof=1), rel=1e-9)
+    ) for size in (1.0, 1e-5))
+    some, more = np.linspace(0.0, 5.0, 6), np.arange(-7.0, 9.0)  # with rows of others
+    for about, rows in ((regression, some), (regression, more), (small, some)):
+        level = noise_level(directly, about, Rows(rows), np.ones(1))
+        assert level == pytest.approx(np.std(sample, ddof=1), rel=1e-9)
 
 
 def test_the_level_of_segments_is_their_mean_square_over_time(monkeypatch):
@@ -275,6 +281,44 @@ def test_gaps_written_as_numbers_and_rounding_are_told(change, told):
     noise = 0.02 if told.startswith("explain") else 0.0
     y = change(clean + noise * np.random.default_rng(3).standard_normal(len(t)))
     assert told in run(plant, data={"t": t, "y": y}).verdict
+
+
+NOTHING = np.zeros(5)
+WHITE = ": the estimates explain the data up to white noise"
+NOT = " is not white (its correlation is "
+FAR = (": some samples are far from what explains the others, 24 of y (first at t = 0.14), which "
+       "suggests gaps that are written as numbers (data.gaps), or a sensor that fails")
+
+
+@pytest.mark.parametrize(("fit", "said"), [
+    ({"least": 0.01}, (", where least squares of the same data leave 0.01: what is left says more "
+                       "of these estimates than of the model")),
+    ({"least": 0.02}, WHITE),
+    ({"residual": [5e-5], "least": 1e-9}, ": the estimates explain the data"),
+    ({"correlation": None}, ""), ({"correlation": None, "ratio": 3.9}, f", 3.90{TIMES}"),
+    ({"correlation": None, "ratio": 4.1}, f", 4.10{TIMES}, which suggests {WHY}"),
+    ({"ratio": 0.05, "slow": True}, f": the residual is far below the noise, 0.05{TIMES}"),
+    ({"ratio": 1.1}, f"{WHITE}, 1.10{TIMES}"),
+    ({"ratio": 1.3}, (f": the residual is white, 1.30{TIMES}, which suggests a noisier sensor than "
+                      "was said")),
+    ({"correlation": [0.0, -0.5, 0.0, 0.0, 0.0]}, WHITE),
+    ({"correlation": [0.1, -0.5, 0.0, 0.3, 0.0], "ratio": 1.0},
+     f": the residual, 1.00{TIMES},{NOT}0.50), which suggests {WHY}"),
+    ({"slow": True}, f": the residual{NOT}0.00, and a part of it is slow), which suggests {WHY}"),
+    ({"follows": True, "in_matrices": ("y", "z")}, (
+        f": the residual{NOT}0.00, and it follows the inputs), which noise of y, z in the matrices "
+        f"does (observer.remedy=noise_free takes it out); or it suggests {WHY}")),
+    ({"slow": True, "rounded": [("y", 0.05)]}, (
+        f": the residual{NOT}0.00, and a part of it is slow), which suggests that it is rounding "
+        f"(y to steps of 0.05), for which deviations are too small, or {WHY}")),
+    ({"far": [("y", 24, 0.14)], "ratio": 2.0}, f"{FAR}, 2.00{TIMES}"),
+    ({"far": [("y", 24, 0.14)], "slow": True},
+     f"{FAR}; without them the residual is not white, which they may have made, or {WHY}"),
+])
+def test_what_a_residual_says_of_the_model(fit, said):
+    """Of five correlations one may be beyond the band of 0.2."""
+    made = {"residual": [0.05], "size": 1.0, "least": 0.05, "correlation": NOTHING, "band": 0.2}
+    assert _explains(Fit(**made | fit), 0) == said
 
 
 def test_at_samples_matrices_may_follow_an_input_without_noise():
@@ -471,6 +515,26 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     size = np.sqrt(np.mean((np.array(errors) / said) ** 2, axis=0))
     assert 0.7 < np.sqrt(np.mean(size**2)) < 1.4
     assert size.max() < 2.2
+
+
+@pytest.mark.parametrize(("name", "gains"), [
+    ("drem", {"gamma": [1e13, 5e13]}), ("ls_drem", {"gamma": [2.0, 10.0], "f0": 1e-2}),
+])
+def test_the_finite_time_law_is_as_uncertain_as_what_it_divides_by_makes_it(name, gains):
+    """η̂_f = (η̂ − w_c η̂(0))/(1 − w_c), w_c ≤ 1 − μ: the share of the start that is left in η̂."""
+    extension = {"drem": "kreisselmeier", "ls_drem": "least_squares"}[name]
+    plain, corrected = (
+        {"name": name, **gains}, {"name": "fct", "extension": extension, "mu": 0.2, **gains}
+    )
+    time = {"horizon": 10, "samples": 11}
+    left = 1.0 - run("descriptor", estimator=plain, time=time).estimates["theta1"] / 1.5
+    one, other = (
+        run("descriptor", estimator=law, noise=NOISE, time=time).details.estimation.parameters_std
+        for law in (plain, corrected)
+    )
+    made = one[:, 1:, 0] / (1.0 - np.minimum(left[:, 1:], 0.8))
+    np.testing.assert_allclose(other[:, 1:, 0], made, rtol=1e-6)
+    assert np.ptp(left[:, 2:-2]) > 0.9
 
 
 @pytest.mark.parametrize(("plant", "more", "why"), [
