@@ -404,6 +404,7 @@ def test_what_continues_and_what_is_a_comment():
     ("R1 a 0 1\nF1 a 0 R1 2", "line 3: F1 is controlled by the current of r1, which has to be"),
     ("V1 a 0 1 2", "is no source"), ("R1 a 0 1\n" * 20001, "lines; at most"),
     ("\n".join(f"R{k} a 0 1" for k in range(5001)), "more than 5000 elements"),
+    ("* only a comment\n.param r=1", "bad: there is no element in it (the first line is a title)"),
 ])
 def test_mistakes_in_netlists(lines, message):
     with refused(message):
