@@ -232,6 +232,13 @@ def test_empty_keys_are_as_good_as_absent_ones(nothing: object) -> None:
     assert plant_from_mapping(plain).m == 0
 
 
+@pytest.mark.parametrize("changes", [{"D": [["t", 0]]}, {"A": [["V", 1], [1, 0]]}])
+def test_inputs_may_be_in_the_outputs_or_in_another_matrix_only(changes: Plain) -> None:
+    c = plant_from_mapping(without("B", **changes)).coefficients.taylor(TIMES, 1)
+    assert (c.B.shape, c.B.any()) == ((2, 5, 2, 2), False)
+    assert c.u[0, 0].tolist() == [1, 0]
+
+
 def test_texts_become_one_line() -> None:
     system = plant_from_mapping(mine(title="two\n  lines", reference=2024), source="f.yaml")
     assert (system.title, system.reference, system.source) == ("two lines", "2024", "f.yaml")
