@@ -296,6 +296,7 @@ BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     ("a: " + "[" * 60, "levels deep"),
     ("a: " + "[" * 100_000, "levels deep"),
     ("? " * 60 + "a", "levels deep"),
+    ("{a: " * 60, "levels deep"),
     ("#" * 2_000_001, "bytes; at most"),
     (DECAYING.replace("name: mine\n", ""), "name is missing"),
     (DECAYING + "name: other\n", "the key name stands twice"),
