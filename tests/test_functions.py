@@ -50,6 +50,18 @@ def test_taylor_coefficients_agree_with_those_of_the_text():
         np.testing.assert_allclose(getattr(ours, name), getattr(text, name), atol=1e-11)
 
 
+@pytest.mark.parametrize("changes", [{}, {"A": lambda t: circuit_A(t) * [1, 1, 1, 1, 0, 1]}])
+def test_entries_of_arrays_are_those_that_are_not_always_zero(changes):
+    t, source = np.linspace(0.0, 9, 23), circuit(**changes).coefficients
+    found, full = source.entries(t, 3), source.taylor(t, 3)
+    for name in ("E", "A", "B", "C"):
+        whole = np.zeros_like(getattr(full, name))
+        for (i, j), values in found.of(name).items():
+            assert values.any()
+            whole[:, :, i, j] = values
+        np.testing.assert_array_equal(whole, getattr(full, name))
+
+
 def test_the_experiment_does_not_see_where_a_plant_comes_from():
     settings = Settings(estimator={"name": "drem"}, time=TimeSettings(horizon=8.0))
     ours = run_experiment(settings, circuit())
