@@ -416,6 +416,15 @@ def test_a_component_is_lost_where_its_error_first_exceeds_it(grown, lost):
     assert errors.lost == lost
 
 
+def test_a_component_that_is_nothing_beside_the_largest_is_not_lost():
+    size, error, one = np.array([[1.0], [1e-11]]), np.full((2, 1), 1e-10), np.ones((2, 1))
+    problem = LinearProblem(lambda t, inside: None, one, units=one)
+    for larger, lost in ((1.0, 1), (1e5, 0)):  # that of 1e-5 is more than a millionth of 1
+        carried = larger * error
+        errors = judged_errors(problem, carried[None], carried, 0 * one, size, 0 * one, size)
+        assert errors.lost == lost
+
+
 def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
     size, one = np.array([[1.0], [1e-11]]), np.ones((2, 1))
     problem = LinearProblem(lambda t, inside: None, one, units=one)
