@@ -15,7 +15,7 @@ from examples import ROOT, environment, gpebo
 from processes import assert_refused
 
 from gpebo_cli.cli.app import COMMANDS
-from gpebo_cli.cli.completion import SHELLS, candidates
+from gpebo_cli.cli.completion import SHELLS, answer, candidates
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.evidence.metrics import NAMES
 from gpebo_cli.observers.gpebo import Gpebo
@@ -58,6 +58,12 @@ def test_groups_and_their_values():
     assert names("check", "plant=cir") == ["plant=circuit"]
     (line,) = candidates(["run", "plant=cir"], [])
     assert line == "plant=circuit\telectrical circuit with time-varying elements, index 2"
+
+
+@pytest.mark.parametrize("command", ["gpebo", "/usr/bin/gpebo", "x=1 gpebo", "another_name"])
+def test_a_line_begins_with_the_command_whatever_its_name(command, capsys):
+    assert answer(["--line", f"{command} compl"], list(COMMANDS)) == 0
+    assert capsys.readouterr().out.split("\t")[0].strip() == "completion"
 
 
 def test_values_of_ones_own_folder(here):
