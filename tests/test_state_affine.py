@@ -668,6 +668,18 @@ def test_a_solution_that_slides_along_a_jump_is_refused_in_time(time, plant):
         run({"name": "friction", **plant}, time={"horizon": 10.0, "samples": 11})
 
 
+def test_the_unit_of_time_does_not_change_why_a_solution_ends():
+    """Friction that holds a mass, in milliseconds."""
+    plant = {
+        "name": "friction", "states": ["v"], "inputs": {"u": "2e-4*sin(t/1000)"}, "outputs": ["y"],
+        "E": [[1]], "A": [[0]], "B": [[1]], "phi": ["-5e-4*sign(y)"], "C": [[1]],
+        "initial_state": [1.0],
+    }
+    said = r"beyond t = 2773\.1\d* .* no solution that slides along a jump"
+    with pytest.raises(SolverError, match=said):
+        run(plant, time={"horizon": 3e3, "samples": 11})
+
+
 def test_a_transistor_that_is_almost_off_acts_all_the_same():
     """Its small currents are derivatives and no rounding: without them Newton's method fails."""
     result = run("published/transistor", observer="none", time={"horizon": 0.05, "samples": 11})
