@@ -494,6 +494,15 @@ def test_a_full_plant_of_index_3_is_the_sparse_one_in_other_coordinates():
     np.testing.assert_allclose(final, plain.signals.states.final, atol=1e-9)
 
 
+def test_a_full_plant_with_equations_that_are_there_twice_is_refused():
+    """All 30 algebraic equations determine the same state: what they differ by is rounding."""
+    rng = np.random.default_rng(0)
+    E, A = rng.standard_normal((2, 51, 51))
+    E[21:], A[21:, 1:] = 0.0, 0.0
+    with pytest.raises(ModelError, match="is an equation missing, or there twice"):
+        simulate.simulate(full_plant(E, A, np.ones((51, 1))), TIME, SolverSettings())
+
+
 @pytest.mark.parametrize("size", [1e-6, 1e-9])
 def test_singular_values_that_decide_nothing_are_left_to_the_derivative_array(size):
     E, A, B = matrices(saddle(48, 11, np.random.default_rng(6)))

@@ -110,6 +110,8 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     found, least = _constraints(e, a, max_mu)
     A2 = np.concatenate([np.zeros((0, n)), *(C for C, _ in found)])
     count, levels = len(A2), max(len(found), 1)
+    if count > n:  # some of them are rounding: equations that depend on others
+        raise UndecidedError
     known_in = np.zeros((levels, count, n))
     place = 0
     for C, p in found:
