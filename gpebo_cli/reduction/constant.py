@@ -122,9 +122,9 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     free = np.linalg.svd(A2)[2][count:].T if count else np.eye(n)
     Z1 = np.linalg.svd(e @ free, full_matrices=False)[0]
     whole = np.concatenate([Z1.T @ e, A2])
-    size = np.linalg.norm(whole, axis=1)
-    inverse = inverses((whole / size[:, None])[None])[0] / size
-    if not np.linalg.norm(inverse * size) < 1.0 / _CLEAR:
+    # Rows of A2 have unit length: what constraints determine is of the same scale before and after.
+    inverse = inverses((whole / np.linalg.norm(whole, axis=1)[:, None])[None])[0]
+    if not np.linalg.norm(inverse) < 1.0 / _CLEAR:
         raise UndecidedError
     d = n - count
     constrained = -columns[:, None] * inverse[:, d:]
