@@ -137,6 +137,7 @@ def test_the_sampled_run_tells_what_the_continuous_one_tells():
     ours = run(system, {"name": "ls_drem"}, 20.0, sample_time=0.01, hold="linear")
     theirs = run(system, {"name": "ls_drem"}, 20.0)
     assert ours.excitation.is_ie
+    assert ours.excitation.window == pytest.approx(theirs.excitation.window)
     assert ours.excitation.t_c == pytest.approx(theirs.excitation.t_c, abs=0.021)
     assert ours.excitation.determined == pytest.approx(theirs.excitation.determined, abs=0.021)
     assert ours.excitation.lambda_min == pytest.approx(theirs.excitation.lambda_min, rel=1e-3)
