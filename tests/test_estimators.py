@@ -796,6 +796,16 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
 
 
+@pytest.mark.parametrize("mu", [[0.01, 0.9], [0.9, 0.01]])
+def test_separate_estimators_require_what_one_of_them_lacks(mu):
+    """w_c = 1 − μ is reached when γ∫Δ² = −ln(1 − μ): 0.3 here, enough for one of them."""
+    both = estimators.build({"name": "fct", "mu": mu, "gamma": 10.0})
+    required = both.estimate(CLEAN, T).requirement
+    assert not required.holds
+    assert required.evidence["gamma_times_integral"] == pytest.approx(0.3, abs=0.1)
+    assert required.evidence["needed"] == pytest.approx(-np.log(0.1))
+
+
 @pytest.mark.parametrize(("beta", "more"), [
     (0.0, np.sin), (0.4, np.sin), (0.0, lambda t: 2.0 * np.expm1(-3.0 * t)),
 ])
