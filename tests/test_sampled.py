@@ -309,6 +309,8 @@ def test_the_factor_is_that_of_the_gram_matrix(hold):
     np.testing.assert_allclose(
         np.swapaxes(S, 1, 2)[:, :3] @ S, gram, atol=1e-12 * np.abs(gram).max()
     )
+    found, expected = spectrum(S, np.ones(len(S))), np.linalg.eigvalsh(gram[..., :3])  # ascending
+    np.testing.assert_allclose(found.eigenvalues, expected, atol=1e-12 * expected.max())
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
