@@ -699,6 +699,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "drem", "gamma": {"p1": 1.0}}, "no value for 'p2'"),
         ({"name": "least_squares", "beta": -1}, "estimator.beta: expected 0 or a positive"),
         ({"name": "least_squares", "bound": 1, "f0": 0.1}, r"below 1/f0 = 10"),
+        *[({"name": "least_squares", "beta": [1e60] * k}, r"1e\+60 is too large") for k in (1, 9)],
         ({"name": "fct", "mu": 1.5}, "between 0 and 1"),
         ({"name": "power", "alpha": 1.5}, "0 < alpha < 1 < beta"),
         ({"name": "instrumental", "delay": 0}, r"estimator\.delay: expected a positive"),
