@@ -142,6 +142,8 @@ def test_nothing_to_estimate_is_exciting_and_gives_the_states():
     assert names["Assumption 2"].holds
     for estimator in ("ls_drem", "drem", "gradient"):
         details = run(lti(A=[[-1, 1], [1, 0]]), estimator=estimator).details
+        assert details.verdict.startswith("interval-exciting from t = 0 s on (")
+        assert details.excitation.determined is None  # there are no parameters
         assert details.simulation.states.shape == details.estimation.states[0].shape
         np.testing.assert_allclose(
             details.estimation.states[0], details.simulation.states, atol=1e-12

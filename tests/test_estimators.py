@@ -699,6 +699,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "drem", "gamma": {"p1": 1.0}}, "no value for 'p2'"),
         ({"name": "least_squares", "beta": -1}, "estimator.beta: expected 0 or a positive"),
         ({"name": "least_squares", "bound": 1, "f0": 0.1}, r"below 1/f0 = 10"),
+        *[({"name": "least_squares", "beta": [1e60] * k}, r"1e\+60 is too large") for k in (1, 9)],
         ({"name": "fct", "mu": 1.5}, "between 0 and 1"),
         ({"name": "power", "alpha": 1.5}, "0 < alpha < 1 < beta"),
         ({"name": "instrumental", "delay": 0}, r"estimator\.delay: expected a positive"),
@@ -794,6 +795,16 @@ def test_a_plain_field_is_an_axis_of_separate_estimators():
     assert found.delta(T).shape == (6, len(T))
     with pytest.raises(ConfigError, match=r"estimator\.mu: expected .*, got 'x'"):
         estimators.build({"name": "fct", "mu": [0.1, "x"]})
+
+
+@pytest.mark.parametrize("mu", [[0.01, 0.9], [0.9, 0.01]])
+def test_separate_estimators_require_what_one_of_them_lacks(mu):
+    """w_c = 1 − μ is reached when γ∫Δ² = −ln(1 − μ): 0.3 here, enough for one of them."""
+    both = estimators.build({"name": "fct", "mu": mu, "gamma": 10.0})
+    required = both.estimate(CLEAN, T).requirement
+    assert not required.holds
+    assert required.evidence["gamma_times_integral"] == pytest.approx(0.3, abs=0.1)
+    assert required.evidence["needed"] == pytest.approx(-np.log(0.1))
 
 
 @pytest.mark.parametrize(("beta", "more"), [

@@ -284,6 +284,15 @@ def test_what_follows_an_input_far_below_the_noise_is_told_and_white_noise_does_
     assert not _follows(white[0] + late, inputs[:, :0])
 
 
+@pytest.mark.parametrize(("count", "told"), [(13, False), (14, True)])
+def test_fewer_samples_than_inputs_explain_say_nothing(count, told):
+    """Three inputs, now and one sample ago, and the mean: 7 numbers, with 5 or 6 left for noise."""
+    rng = np.random.default_rng(0)
+    inputs = rng.standard_normal((count, 3))
+    residual = inputs[:, :1] + 1e-3 * rng.standard_normal((count, 1))
+    assert _follows(residual, inputs) == told
+
+
 def test_a_rate_that_is_five_percent_off_follows_the_input():
     right, wrong = (one_state(A=[[a]], B=[[1]], inputs={"u": "sin(3*t)"}) for a in (-1.0, -1.05))
     made = run(right, observer="none", time={"samples": 2001})

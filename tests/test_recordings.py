@@ -25,6 +25,7 @@ from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.metrics import STANDING
 from gpebo_cli.experiment.pipeline import run_experiment, stream
+from gpebo_cli.experiment.several import _joined
 from gpebo_cli.model import archive
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
@@ -949,6 +950,20 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     np.testing.assert_allclose(
         result.estimates["h1"][0, -1], one.estimates["h1"][0, -1], atol=1e-5
     )
+
+
+def test_what_is_known_at_samples_of_several_files_is_put_one_after_the_other():
+    """Elements and samples move by the same; where two files meet, the second one's count."""
+    first, second = (
+        Mesh(np.array(edges), radau_rule(3)).sampled(np.array(t), np.array(values))
+        for edges, t, values in (
+            ([0.0, 1.0, 2.0], [0.0, 2.0], [1.0, 2.0]),
+            ([5.0, 6.0, 8.0], [5.0, 7.0, 8.0], [3.0, 4.0, 5.0]),
+        )
+    )
+    both = _joined([first, second], [0.0, -3.0])
+    np.testing.assert_array_equal(both.mesh.edges, [0.0, 1.0, 2.0, 3.0, 5.0])
+    np.testing.assert_array_equal(both(np.array([0.0, 2.0, 4.0, 5.0])), [1.0, 3.0, 4.0, 5.0])
 
 
 def test_deviations_of_several_files_are_those_of_independent_data(tmp_path):

@@ -228,6 +228,15 @@ def test_the_regression_holds_in_every_segment(name):
         np.testing.assert_allclose(reset.parameters(before), after, atol=1e-8)
 
 
+def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
+    """One of a hundredth of a second shows little: the state is what those before it tell."""
+    system = plant_from_mapping(MIXED)
+    signals, observation = along(system, 20.0, remedy="reset", reset_times=[6.0, 6.01])
+    eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
+    assert eta[0, 0] == 0.7
+    np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
+
+
 def test_growth_is_that_of_the_longest_segment():
     """Of e^t over one, two and one seconds."""
     plant = plant_from_mapping(one_state(
@@ -540,6 +549,15 @@ def test_estimators_of_other_packages_are_refused_where_they_cannot_go_on(remedy
     )
     with pytest.raises(ConfigError, match=message):
         run_experiment(settings_of, plant_from_mapping(UNBOUNDED), estimator=Outsider())
+
+
+def test_without_an_observer_an_estimator_that_is_given_is_not_asked():
+    found = run_experiment(
+        Settings(estimator={}, time=TimeSettings(horizon=1.0), observer={"name": "none"}),
+        plant_from_mapping(UNBOUNDED), estimator=Outsider(),
+    )
+    assert found.simulation.t[-1] == 1.0
+    assert found.estimation is None
 
 
 @pytest.mark.parametrize("name", ["ls_drem", "lion", "fct"])

@@ -137,6 +137,7 @@ def test_the_sampled_run_tells_what_the_continuous_one_tells():
     ours = run(system, {"name": "ls_drem"}, 20.0, sample_time=0.01, hold="linear")
     theirs = run(system, {"name": "ls_drem"}, 20.0)
     assert ours.excitation.is_ie
+    assert ours.excitation.window == pytest.approx(theirs.excitation.window)
     assert ours.excitation.t_c == pytest.approx(theirs.excitation.t_c, abs=0.021)
     assert ours.excitation.determined == pytest.approx(theirs.excitation.determined, abs=0.021)
     assert ours.excitation.lambda_min == pytest.approx(theirs.excitation.lambda_min, rel=1e-3)
@@ -308,6 +309,8 @@ def test_the_factor_is_that_of_the_gram_matrix(hold):
     np.testing.assert_allclose(
         np.swapaxes(S, 1, 2)[:, :3] @ S, gram, atol=1e-12 * np.abs(gram).max()
     )
+    found, expected = spectrum(S, np.ones(len(S))), np.linalg.eigvalsh(gram[..., :3])  # ascending
+    np.testing.assert_allclose(found.eigenvalues, expected, atol=1e-12 * expected.max())
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

@@ -208,11 +208,11 @@ def axis(value: object, where: str, accept: Accepted = "positive") -> tuple[floa
     items = list(value) if isinstance(value, Sequence) else [value]
     if not items:
         raise ConfigError(f"{where} is an empty list; give a number, a list or logspace(a, b, n)")
+    largest = _LARGEST if accept == "positive" else LARGEST
     if len(items) > _MANY and set(map(type, items)) <= {float, np.float64}:
         values = np.array(items)
-        if values.max() <= _LARGEST and values.min() > 0.0:
+        if values.max() <= largest and values.min() > 0.0:
             return tuple(values.tolist())
-    largest = _LARGEST if accept == "positive" else LARGEST
     return tuple(number(item, where, accept, largest) for item in items)
 
 
