@@ -33,6 +33,7 @@ from gpebo_cli.observers.reduced.split import (
     within_frame,
 )
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
+from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.regression.errors import ErrorSystem
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
@@ -163,7 +164,7 @@ def observer_matrices(
     # Products with axes have no rounding that would have to be found.
     axes = axes_frame(largest_over_time(model.E)) if like is None and frame is None else frame
     if plain and axes is not None and axes.remaining is None and axes.axes:
-        found = _in_frame(model, units.equations, scale, axes, rank_tol)
+        found = _in_frame(model, units, scale, axes, rank_tol)
         if found is not None:
             return found
     found = _by_steps(
@@ -175,9 +176,10 @@ def observer_matrices(
 
 
 def _in_frame(
-    model: Equations, rows: Array, scale: Array, frame: Frame, rank_tol: float
+    model: Equations, units: Units, scale: Array, frame: Frame, rank_tol: float
 ) -> ObserverMatrices | None:
     """What :func:`_by_steps` finds in the frame of E; None where singular values have to decide."""
+    rows = units.equations
     found = kernels.observer.in_frame(
         *model[:5], rows, scale, frame.domain, frame.range, frame.kernel, frame.equations
     )
@@ -186,6 +188,9 @@ def _in_frame(
     (sizes, pinv, algebraic, on_basis, g_signals, G, Q1, H, injectivity, dynamics, from_unknowns,
      from_signals) = found
     outside, inner, inverse = sizes.tolist()
+    if H.shape[2] and (units.states != 1.0).any():  # as of states in their units
+        of_inverse = np.linalg.norm(H / units.states[:, None], axis=(1, 2))
+        injectivity = 1.0 / (of_inverse * np.linalg.norm(algebraic * units.states, axis=(1, 2)))
     size = 0.0 if outside == 0.0 else float(np.abs(model.E / rows[:, None]).max(initial=0.0))
     weakest = float(injectivity.min(initial=np.inf))
     if not (
