@@ -65,6 +65,17 @@ def check_keys(given: Iterable[object], known: Collection[str], where: str) -> N
             )
 
 
+def listed(names: Sequence[str]) -> str:
+    """The names with commas, the first eight of them."""
+    return ", ".join([*names[:8], *(["..."] if len(names) > 8 else [])])
+
+
+def counted(number: int, noun: str) -> str:
+    """``1 row``, ``2 rows``, ``3 entries``."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{number} {noun if number == 1 else plural}"
+
+
 def shown(value: object) -> str:
     """A value as a message repeats it: on one line, printable, and not too long."""
     try:

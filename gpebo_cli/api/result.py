@@ -19,14 +19,13 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.findings import Assumption, replaced
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.matrix import counted
 from gpebo_cli.results import figures, html
 from gpebo_cli.results.figures import truth_at
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.report import case_cells, case_rows, run_lines
 from gpebo_cli.results.style import draw_on
 from gpebo_cli.results.tables import frame
-from gpebo_cli.schema import shown, unknown
+from gpebo_cli.schema import counted, shown, unknown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

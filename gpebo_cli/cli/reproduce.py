@@ -13,7 +13,7 @@ from gpebo_cli.cli.figures import known_recipe, recipe_jobs, run_recipe_job
 from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import read, shown
+from gpebo_cli.schema import counted, read, shown
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import RunResult
@@ -73,8 +73,6 @@ def main(words: list[str]) -> int:
     off = [finding for finding in findings if not finding.holds]
     count = len({finding.recipe for finding in findings})
     if off or not options.quiet:
-        from gpebo_cli.model.matrix import counted
-
         numbers = counted(len(findings), "number")
         sys.stdout.write(f"{counted(count, 'recipe')}, {numbers}, {len(off)} off\n")
     return 1 if off else 0

@@ -28,13 +28,12 @@ from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
-from gpebo_cli.model.matrix import counted
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.files import csv_text, make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
 from gpebo_cli.results.report import case_rows, columns
 from gpebo_cli.results.sweep_folder import STOP, TABLE, JobRecord, Plan
-from gpebo_cli.schema import shown
+from gpebo_cli.schema import counted, shown
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader

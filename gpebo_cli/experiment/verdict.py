@@ -20,8 +20,8 @@ from gpebo_cli.experiment.result import (
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
-from gpebo_cli.model.matrix import counted
 from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.schema import counted
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model

@@ -13,7 +13,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.model.expressions import shorten
-from gpebo_cli.schema import nearest
+from gpebo_cli.schema import counted, listed, nearest
 
 
 @dataclass(frozen=True)
@@ -28,17 +28,6 @@ class Side:
         verb = "is" if len(self.names) == 1 else "are"
         named = f" ({listed(self.names)})" if self.names else ""
         return f"there {verb} {counted(len(self.names), self.noun)}{named}"
-
-
-def listed(names: Sequence[str]) -> str:
-    """The names with commas, the first eight of them."""
-    return ", ".join([*names[:8], *(["..."] if len(names) > 8 else [])])
-
-
-def counted(number: int, noun: str) -> str:
-    """``1 row``, ``2 rows``, ``3 entries``."""
-    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
-    return f"{number} {noun if number == 1 else plural}"
 
 
 def items_of(value: object) -> list[object] | None:

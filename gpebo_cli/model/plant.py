@@ -16,9 +16,9 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.expressions import RESERVED, Expression, parse, shorten, signal
-from gpebo_cli.model.matrix import Side, brief, counted, is_empty, items_of, listed, matrix, per_row
+from gpebo_cli.model.matrix import Side, brief, is_empty, items_of, matrix, per_row
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
-from gpebo_cli.schema import check_keys, nearest
+from gpebo_cli.schema import check_keys, counted, listed, nearest
 
 KEYS = (
     "name", "title", "reference", "parameters", "states", "inputs", "unknowns", "outputs",

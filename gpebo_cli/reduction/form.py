@@ -22,12 +22,12 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
-from gpebo_cli.model.matrix import listed
 from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.scaling import Units, units_at
 from gpebo_cli.reduction.strangeness_free import LOOKS, reduced
 from gpebo_cli.reduction.structure import Structure, analyse
+from gpebo_cli.schema import listed
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # of what of the plant is looked at before its samples come
 _SEEN = 2  # derivatives at the start by which an entry that is zero there is known
