@@ -242,7 +242,8 @@ def _by_steps(
     own = split.kernel / units.states[:, None]
     kernel = split.kernel / np.linalg.norm(own, axis=1, keepdims=True)
     size = np.maximum(np.linalg.norm(algebraic * units.states, axis=(1, 2)), TINY)
-    arguments = system, algebraic @ kernel, kernel, size, t, rank_tol
+    terms = np.abs(algebraic) @ (units.states[:, None] * (kernel != 0.0))
+    arguments = system, without_rounding(algebraic @ kernel, terms), kernel, size, t, rank_tol
     if frame is not None and frame.remaining is not None:
         Q1, K, injectivity = _eliminate_in_part(*arguments, units.states, frame.remaining.rank)
     else:
