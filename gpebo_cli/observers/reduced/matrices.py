@@ -239,15 +239,16 @@ def _by_steps(
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
-    own = split.kernel / units.states[:, None]
-    kernel = split.kernel / np.linalg.norm(own, axis=1, keepdims=True)
+    own = without_rounding(split.kernel / units.states[:, None])
+    kernel = units.states[:, None] * (own / np.linalg.norm(own, axis=1, keepdims=True))
+    terms = np.abs(algebraic) @ np.abs(kernel)
+    on_kernel = without_rounding(algebraic @ kernel, terms)
     size = np.maximum(np.linalg.norm(algebraic * units.states, axis=(1, 2)), TINY)
-    terms = np.abs(algebraic) @ (units.states[:, None] * (kernel != 0.0))
-    arguments = system, without_rounding(algebraic @ kernel, terms), kernel, size, t, rank_tol
+    arguments = system, on_kernel, kernel, size, t, rank_tol
     if frame is not None and frame.remaining is not None:
         Q1, K, injectivity = _eliminate_in_part(*arguments, units.states, frame.remaining.rank)
     else:
-        Q1, K, injectivity = _eliminate(*arguments)
+        Q1, K, injectivity = _eliminate(*arguments, terms)
     rounding = None
     if hidden is not None:
         outputs = Q1.shape[1] - r
@@ -325,12 +326,13 @@ def _seen_through(
 
 def _eliminate(
     system: DescriptorSystem, on_kernel: Array, kernel: Array, size: Array, t: Array,
-    rank_tol: float,
+    rank_tol: float, terms: Array,
 ) -> tuple[Array, Array, Array]:
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
     From 𝒜 V2 on a basis V2 of the kernel of E (N, n, n_b), and the size (N,) of 𝒜. σ_min(R1) ≥
-    1/‖R1⁻¹‖_F; it is computed itself only where that bound leaves a doubt.
+    1/‖R1⁻¹‖_F; where that bound leaves a doubt, it is computed, of rows beside the sizes of their
+    ``terms``, those of 𝒜 V2: some may be small, but what is rounding sees nothing.
     """
     if kernel.shape[2] == 0:
         return on_kernel, kernel[:1], np.full(len(size), np.inf)
@@ -339,8 +341,8 @@ def _eliminate(
     bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
     doubtful = np.flatnonzero(~(bound > rank_tol))
     if len(doubtful):
-        sigma = np.linalg.svd(on_kernel[doubtful], compute_uv=False)
-        smallest = sigma[:, -1] / np.maximum(sigma[:, 0], TINY)
+        rows = np.maximum(terms[doubtful].max(axis=2, keepdims=True), TINY)
+        smallest = np.linalg.svd(on_kernel[doubtful] / rows, compute_uv=False)[:, -1]
         bound[doubtful] = smallest
         if (smallest <= rank_tol).any():
             k = int(np.argmax(smallest <= rank_tol))
