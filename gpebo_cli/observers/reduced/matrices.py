@@ -132,10 +132,15 @@ class ObserverMatrices:
         The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
         has to fulfil, and w must stay in range P.
         """
+        def less(own: Array, seen: Array) -> Array:
+            return without_rounding(
+                own - gain @ seen, np.abs(own) + np.abs(gain) @ np.abs(seen)
+            )
+
         return replace(
-            self, dynamics=self.dynamics - gain @ self.on_basis,
-            from_unknowns=self.from_unknowns - gain @ self.G,
-            from_signals=self.from_signals - gain @ self.g_signals,
+            self, dynamics=less(self.dynamics, self.on_basis),
+            from_unknowns=less(self.from_unknowns, self.G),
+            from_signals=less(self.from_signals, self.g_signals),
         )
 
 
@@ -304,8 +309,10 @@ def _held(found: ObserverMatrices, units: Array, rank_tol: float) -> ObserverMat
         return found
     rate = 2.0 * np.linalg.norm(found.dynamics * own / own[:, None], axis=(1, 2))
     gain = np.zeros((len(lacking), len(own), hidden + found.outputs))
-    gain[:, :, :hidden] = own[:, None] * np.linalg.pinv(lacking, rcond=_LACKING)
-    return found.injected(rate[:, None, None] * (gain @ found.residual))
+    inverse = np.asarray(np.linalg.pinv(lacking, rcond=_LACKING), dtype=np.float64)
+    gain[:, :, :hidden] = own[:, None] * without_rounding(inverse)
+    through = without_rounding(gain @ found.residual, np.abs(gain) @ np.abs(found.residual))
+    return found.injected(rate[:, None, None] * through)
 
 
 def _seen_through(
