@@ -90,6 +90,19 @@ def chain(cells):
     return E, A, B, C
 
 
+def grid(cells):
+    """Heat on cells × 3 nodes: loops, which elimination fills; conductances over four decades."""
+    n = 3 * cells
+    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
+    for i in range(n):
+        for j in {i + 1, i + 3} & set(range(n)):
+            g = 10.0 ** (4 * (i * 7 % n) / n)
+            A[np.ix_([i, j], [i, j])] += g * np.array([[-1.0, 1.0], [1.0, -1.0]])
+    A[0, 0] -= 1.0
+    B[0, 0] = C[0, 0] = C[1, -1] = 1.0
+    return E, A, B, C
+
+
 PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
 
 
@@ -166,44 +179,54 @@ def test_errors_are_not_larger_than_they_are_said_to_be(build):
         assert (off <= 10.0 * found.state_errors * np.abs(true).max(axis=0)).all()
 
 
-def test_a_change_of_units_changes_nothing():
-    system, found = plant(ladder, varying=True), []
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize(("build", "rate"), [
+    *((build, 1.0) for build in (ladder, current_source, floating, chain, grid)), (ladder, 1e5),
+])
+def test_a_change_of_units_and_signs_changes_nothing(build, rate, varying):
+    """States, equations, time and the input: structure, start, solution, its errors, elements."""
+    E, A, B, C = build(CELLS)
+    n, rng, found = len(E), np.random.default_rng(1), []
+    start = np.array([1.0, 0.5, *[0.1] * (n - 2)])
     for power in (0.0, 1.0):
-        units = 10.0 ** (power * np.linspace(-9, 6, system.n))
-        E, A, B, C = ladder(CELLS)
-        found.append(units * large.large_simulation(load_plant({
-            "name": "units", "states": list(system.states), "inputs": {"u": "sin(t)"},
-            "outputs": ["y1", "y2"], "E": (E * units).tolist(), "B": B.tolist(),
-            "A": [[f"{v!r}*(1 + 0.1*sin(t))" for v in row] for row in (A * units).tolist()],
-            "C": (C * units).tolist(), "initial_state": (system.initial_state / units).tolist(),
-        }), TIME, SolverSettings()).signals.states.final)
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-7)
+        x, rows = (10.0 ** (power * rng.integers(-6, 7, n)) * rng.choice([-1.0, 1.0], n) ** power
+                   for _ in range(2))
+        T, d = 10.0 ** (power * 3), -10.0 ** (power * 2) if power else 1.0
+
+        def text(matrix, factor, x=x, rows=rows, T=T):
+            scaled = (rows[:, None] * matrix / x).tolist()
+            return [[f"{v!r}*({factor.format(f't/{T!r}')})" if v and varying else v for v in row]
+                    for row in scaled]
+
+        one = large.large_simulation(load_plant({
+            "name": "units", "states": [f"x{k}" for k in range(n)], "outputs": ["y1", "y2"],
+            "inputs": {"u": f"{d!r}*sin(t/{T!r})"}, "E": text(T * E, "1 + 0.3*cos({})"),
+            "A": text(rate * A, "1 + 0.2*sin({})"), "B": (rows[:, None] * B / d).tolist(),
+            "C": (C / x).tolist(), "initial_state": (start * x).tolist(),
+        }), TimeSettings(horizon=8.0 * T), SolverSettings(tol=1e-9))
+        found.append((one, one.initial_state / x, one.signals.states.values / x))
+    (one, start, x), (other, again, y) = found
+    size, parts = np.abs(x).max(axis=(0, 1)), ("mu", "a", "d")
+    assert [getattr(one.structure, p) for p in parts] == [
+        getattr(other.structure, p) for p in parts]
+    assert (np.abs(again - start) < 1e-14 * size).all()
+    assert (np.abs(y[-1, -1] - x[-1, -1]) < 1e-10 * size).all()
+    assert np.abs(np.log(other.state_errors / one.state_errors)).max() < np.log(8.0)
+    assert len(x) / 3 < len(y) < 3 * len(x)
 
 
+@pytest.mark.parametrize(("matrix", "k"), [("E", 2), ("A", -1)])
 @pytest.mark.parametrize("factor", ["sin(t - 4)", "(0.01 + (t - 4)**2)"])
-def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(factor):
+def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(matrix, k, factor):
     E, A, B, C = ladder(CELLS)
-    rows = A.tolist()
-    rows[-1][-1] = factor
+    rows = {"E": E.tolist(), "A": A.tolist()}
+    rows[matrix][k][k] = factor
     system = load_plant({
         "name": "near", "states": [f"x{k}" for k in range(len(E))], "inputs": {"u": "sin(t)"},
-        "outputs": ["y1", "y2"], "E": E.tolist(), "A": rows, "B": B.tolist(), "C": C.tolist(),
+        "outputs": ["y1", "y2"], **rows, "B": B.tolist(), "C": C.tolist(),
         "initial_state": [0.0] * len(E),
     })
     assert large.large_simulation(system, TIME, SolverSettings()) is None
-
-
-def grid(cells):
-    """Heat on cells × 3 nodes: loops, which elimination fills; conductances over four decades."""
-    n = 3 * cells
-    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
-    for i in range(n):
-        for j in {i + 1, i + 3} & set(range(n)):
-            g = 10.0 ** (4 * (i * 7 % n) / n)
-            A[np.ix_([i, j], [i, j])] += g * np.array([[-1.0, 1.0], [1.0, -1.0]])
-    A[0, 0] -= 1.0
-    B[0, 0] = C[0, 0] = C[1, -1] = 1.0
-    return E, A, B, C
 
 
 @pytest.mark.parametrize("varying", [False, True])
