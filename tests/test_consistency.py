@@ -17,8 +17,8 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.scaling import balance
-from gpebo_cli.reduction.stages import in_stages
+from gpebo_cli.reduction.scaling import balance, scales_of
+from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.strangeness_free import forcing, strangeness_free_form
 from gpebo_cli.reduction.structure import _probe_times, analyse
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -190,3 +190,35 @@ def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     })
     x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
     np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)
+
+
+@settings(max_examples=20)
+@given(SEEDS, st.integers(2, 30))
+def test_scales_of_full_matrices_make_largest_entries_one(seed, n):
+    """Of rows, of columns, and of E/τ beside A, in any units."""
+    rng = np.random.default_rng(seed)
+    E, A = rng.normal(size=(2, n, n))
+    E[n // 2 :] = 0.0
+    x, of_rows, T = 10.0 ** rng.integers(-6, 7, n), 10.0 ** rng.integers(-6, 7, n), 1e3
+    E, A = T * of_rows[:, None] * E / x, of_rows[:, None] * A / x
+    rows, columns, time = scales_of(E, A)
+    e, a = (np.abs(rows[:, None] * matrix * columns) for matrix in (E / time, A))
+    for axis in (0, 1):
+        np.testing.assert_allclose(np.log2(np.maximum(e, a).max(axis=axis)), 0.0, atol=1.5)
+    beside = np.median((e.max(axis=1) / a.max(axis=1))[: n // 2])
+    assert abs(np.log2(beside)) < 1.5
+
+
+@pytest.mark.parametrize(("usual", "rounding"), [(1.0, False), (1e-12, True)])
+def test_why_a_rank_is_unclear_at_one_time(usual, rounding):
+    """The constraint is what 1e-12 of large terms leaves: just there, or it is so at all times."""
+    turned = np.array([[0.8, -0.6], [0.6, 0.8]])
+    row = np.tile([usual, usual], (5, 1))
+    row[3] = 1e-12, 1e-15
+    A = turned @ np.stack([np.ones((5, 2)), row], axis=1)
+    model = np.zeros((2, 2, 5, 2, 2))
+    model[0, 0], model[1, 0] = turned @ np.diag([1.0, 0.0]), A
+    with pytest.raises(UnclearError) as unclear:
+        in_stages(*model, np.zeros((2, 5, 2, 0)), 1e-10, 1)
+    assert (unclear.value.place, unclear.value.rounding, unclear.value.sudden) == (
+        3, rounding, True)

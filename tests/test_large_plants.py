@@ -650,6 +650,26 @@ def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm):
     assert error <= found.error_estimate * 10.0 <= 1e-6
 
 
+@pytest.mark.parametrize("swing", [0.0, 0.5])
+@pytest.mark.parametrize(("rate", "most"), [(3.0, 6.0), (-3.0, 1.15)])
+def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, most, swing):
+    """sin 20t, of which errors grow or are forgotten; what series leave out comes beside them."""
+    def coefficients(t, inside):
+        rates = rate * (1.0 + swing * np.cos(t if swing else np.zeros(1)))
+        f = 20.0 * np.cos(20.0 * t) - rates * np.sin(20.0 * t)
+        A, f = rates[:, None, None] * np.eye(9), f[:, None, None] * np.ones((9, 1))
+        return LinearEquation(None, A, f)
+
+    one = np.ones((9, 1))
+    problem = LinearProblem(coefficients, 0.0 * one, name="sines", units=one)
+    limits = {"tol": 1e-3, "max_elements": 500}
+    found = series.solve_dense(problem, initial_mesh(0.0, 2.0, [], 20, radau_rule(6)), **limits)
+    other = solve(problem, found.trajectory.mesh, **limits)
+    assert other.trajectory.mesh.size == found.trajectory.mesh.size
+    ratio = found.errors / other.errors
+    assert 1.0 < ratio.min() <= ratio.max() < most
+
+
 def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
     """A ladder in units of all sizes, by sparse factors as by dense ones."""
     rng = np.random.default_rng(3)

@@ -536,6 +536,19 @@ def test_instants_of_iterates_before_leave_no_edges():
     np.testing.assert_allclose(found.signals.states(t), truth, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_short_elements_of_a_guess_have_edges_where_it_jumps(unit):
+    """At 2.05 beside one of 0.05, not at 1.0 and 1.1; longer ones keep theirs, in any unit."""
+    system = plant_from_mapping(one_state(A=[["-y"]]))
+    mesh = Mesh(unit * np.array([0.0, 1.0, 1.1, 2.0, 2.05, 3.0, 3.6, 4.0]), radau_rule(9))
+    guess = np.sin(mesh.points / unit) + (mesh.inside > 2.05 * unit)
+    linear = Linearised(system, Trajectory(mesh, guess[..., None]))
+    for given, jump in ([0.0, 4.0], 2.05), ([0.0, 2.045, 4.0], 2.045):
+        found, bounded = linear.resolved(unit * np.array(given))
+        np.testing.assert_allclose(found / unit, [0.0, jump, 3.0, 3.6, 4.0], rtol=1e-12)
+        assert bounded
+
+
 def test_derivatives_of_what_follows_outputs_have_all_digits():
     """Differences left 1e-10, which hid the rank of rows that cancel: index 3 was refused."""
     system = plant_from_mapping({
@@ -554,9 +567,9 @@ def test_derivatives_along_very_short_elements_are_no_rounding():
         "name": "short", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [["y"]], "C": [[1]],
         "initial_state": [0.0],
     })
-    mesh = Mesh(np.array([0.0, 0.5, 1.0, 1.0 + 1e-9, 1.5, 2.0]), radau_rule(9))
+    mesh = Mesh(np.array([0.0, 1e-9, 0.5, 1.0, 1.0 + 1e-9, 1.5, 2.0, 2.0 + 1e-9]), radau_rule(9))
     guess = Trajectory(mesh, np.sin(mesh.points)[..., None])
-    t = np.array([0.7, 1.0 + 5e-10, 1.2])
+    t = np.array([5e-10, 0.7, 1.0 + 5e-10, 1.2, 2.0 + 5e-10])
     phi = Linearised(system, guess).taylor(t, 2).phi[:, :, 0]
     # x y along the guess, less what stands in A there: −sin² t
     want = np.stack([-np.sin(t) ** 2, -np.sin(2 * t), -np.cos(2 * t)])
