@@ -543,8 +543,8 @@ def test_short_elements_of_a_guess_have_edges_where_it_jumps(unit):
     mesh = Mesh(unit * np.array([0.0, 1.0, 1.1, 2.0, 2.05, 3.0, 3.6, 4.0]), radau_rule(9))
     guess = np.sin(mesh.points / unit) + (mesh.inside > 2.05 * unit)
     linear = Linearised(system, Trajectory(mesh, guess[..., None]))
-    for given, jump in ([0.0, 4.0], 2.05), ([0.0, 2.045, 4.0], 2.045):
-        found, bounded = linear.resolved(unit * np.array(given))
+    for edges, jump in ([0.0, 4.0], 2.05), ([0.0, 2.045, 4.0], 2.045):
+        found, bounded = linear.resolved(unit * np.array(edges))
         np.testing.assert_allclose(found / unit, [0.0, jump, 3.0, 3.6, 4.0], rtol=1e-12)
         assert bounded
 
