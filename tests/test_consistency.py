@@ -19,8 +19,12 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
 from gpebo_cli.reduction.scaling import balance, scales_of
 from gpebo_cli.reduction.stages import UnclearError, in_stages
-from gpebo_cli.reduction.strangeness_free import forcing, strangeness_free_form
-from gpebo_cli.reduction.structure import _probe_times, analyse
+from gpebo_cli.reduction.strangeness_free import (
+    _by_singular_vectors,
+    forcing,
+    strangeness_free_form,
+)
+from gpebo_cli.reduction.structure import _probe_times, analyse, without_equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start
 from gpebo_cli.simulation.simulate import simulate
@@ -222,3 +226,46 @@ def test_why_a_rank_is_unclear_at_one_time(usual, rounding):
         in_stages(*model, np.zeros((2, 5, 2, 0)), 1e-10, 1)
     assert (unclear.value.place, unclear.value.rounding, unclear.value.sudden) == (
         3, rounding, True)
+
+
+@pytest.mark.parametrize(("singular", "value"), [((2.0, 2e-3, 0.0), "1.0e-03"),
+                                                 ((2.0, 2e-12, 0.0), "1.0e-12")])
+def test_a_rank_that_is_another_than_at_the_reference_is_named_with_its_time(singular, value):
+    """Of three, two singular values are zero at first: one of them is not, or a third one is."""
+    structure = replace(without_equations(), a=2 if value == "1.0e-03" else 1, rank_tol=1e-10)
+    M = np.zeros((4, 3, 3))
+    M[:, 0, 0] = 1.0
+    M[:, 1, 1] = 1.0 * (structure.a == 1)
+    M[2] = np.diag(singular)
+    system, N = made(np.random.default_rng(0), 3, 1).system, np.broadcast_to(np.eye(3), M.shape)
+    t = np.array([0.5, 1.0, 1.5, 2.0])
+    said = rf"derivative array changes near t = 1\.5 \(singular value {value}\)"
+    with pytest.raises(ModelError, match=said):
+        _by_singular_vectors(system, structure, N, M, N, t)
+    some = t != 1.5
+    Z1, Z2 = _by_singular_vectors(system, structure, N[some], M[some], N[some], t[some])
+    assert Z1.shape == (3, 3, 3 - structure.a)
+    assert np.abs(np.swapaxes(Z2, 1, 2) @ M[some]).max() < 1e-15
+
+
+@settings(max_examples=10, deadline=None)
+@given(SEEDS)
+def test_terms_of_equations_are_the_sizes_of_what_they_are_the_sum_of(seed):
+    """With large ones of either sign that cancel, at the last of each three times."""
+    rng = np.random.default_rng(seed)
+    A, B, F = rng.normal(size=(3, 3)), 1e6 * rng.normal(size=(3, 2)), rng.normal(size=(3, 1))
+    phi, t = rng.normal(size=3), np.linspace(0.5, 2.0, 6)
+    system = plant_from_mapping({
+        "name": "terms", "states": ["a", "b", "c"], "inputs": {"u": "1 + t", "v": "cos(t)"},
+        "E": np.diag([1, 2, 4]).tolist(), "A": [[f"({x})*t" for x in row] for row in A.tolist()],
+        "B": B.tolist(), "F": F.tolist(), "unknowns": {"w": -3.0}, "phi": phi.tolist(),
+        "initial_state": [0, 0, 0],
+    })
+    structure = analyse(system, 0.0, 2.0, max_mu=2, rank_tol=1e-10)
+    form = strangeness_free_form(system, structure, t, t, points=3)
+    t = t[2::3, None, None]
+    signals = np.abs(np.concatenate([1.0 + t, np.cos(t)], axis=1))
+    known = np.abs(B) @ signals + 3.0 * np.abs(F) + np.abs(phi)[:, None]
+    rows = np.abs(np.broadcast_to(form.E1, (6, 3, 3))[2::3]) / [1, 2, 4]
+    sizes = np.concatenate([np.abs(A) * t, known], axis=2)
+    np.testing.assert_allclose(form.terms, rows @ sizes, rtol=1e-12)
