@@ -357,6 +357,26 @@ def test_iterates_go_on_as_long_as_they_will_do(share, most):
     assert most - 4 <= len(solved) <= most
 
 
+@pytest.mark.parametrize(("changes", "work", "expected"), [
+    ([2e-2, 1e-4, 1e-7], 2.0, 1e-12),  # ten squares of each make the next: ten of 1e-14
+    ([1e-3, 1e-7], 1 + 2 / 3, 1e-13),  # it fell faster: one square
+    ([1e-3, 1e-5, 0.0], 2 + 2 / 3, 0.0),
+])  # fmt: skip
+def test_the_change_of_one_more_iterate_is_expected_from_those_before(changes, work, expected):
+    """Ten times what their squares say; up to a change of 1e-2 they have four digits of twelve."""
+    mesh, values = Mesh(np.array([0.0, 1.0]), radau_rule(5)), [2.0]
+    for change in changes:
+        values.append(values[-1] / (1.0 - change))
+    solved = iter(values)
+
+    def solve(*_):
+        return Trajectory(mesh, np.full((1, 6, 3), next(solved)))
+
+    _, count, cost, last = _window(lorenz(), TimeSettings(horizon=1.0), SOLVER, solve)
+    assert (count, cost) == (len(values), pytest.approx(work))
+    assert last == pytest.approx(expected, rel=1e-2)
+
+
 def test_a_pole_of_time_is_named_before_windows_shrink_towards_it():
     plant = lorenz(A=[[-10, 10, 0], [0, "-tan(t)", "-y"], [0, "y", "-8/3"]])
     with pytest.raises(ConfigError, match=r"A\[1\]\[1\] .* beyond all numbers near t = 1\.5708;"):

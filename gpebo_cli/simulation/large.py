@@ -353,7 +353,7 @@ def _result(
     wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail
     wrong += VALUE * EPS * form.loss * made_of
     scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), _TINY)
-    state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
+    state_errors = wrong / scale
     at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((0, len(x0)))
     jumps = [(float(mesh.edges[k]), x[k - 1, -1], Jump(x[k, 0], none)) for k in at]
     return Simulation(
