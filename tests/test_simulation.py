@@ -223,7 +223,7 @@ def test_index_above_the_limit_is_refused():
         states=[f"x{i}" for i in range(n)], inputs={"u": "sin(t)"}, E=E, A=A,
         B=[[0]] * (n - 1) + [[1]], initial_state=[0] * n,
     )
-    solved = simulate(chain, TimeSettings(horizon=1.0), SOLVER)
+    solved = simulate(chain, TimeSettings(horizon=1.0), SolverSettings(max_strangeness_index=5))
     assert solved.structure.index == 6
     assert not solved.structure.stages  # the derivative array says so: the limit itself will do
     with pytest.raises(ModelError, match=r"solver\.max_strangeness_index = 3; .* raise that to 5"):
