@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,7 +26,7 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
-from gpebo_cli.numerics.rounding import noise_of
+from gpebo_cli.numerics.rounding import kept_share, noise_of
 from tests.kernel_paths import by_both
 
 
@@ -332,6 +335,43 @@ def test_rounding_of_times_moves_what_varies_by_their_size():
     assert truth < noise_of(t[-1:], t[None], swing)[0, 0, 0] < 2 * truth
 
 
+@pytest.mark.parametrize("rate", [1e4, 1e8])
+def test_a_fast_mode_forgets_rounding_within_its_time(rate):
+    """In an element of length h all but 1/(λ h); what is the same at all nodes is not averaged."""
+    def problem(varying):
+        def coefficients(t, inside):
+            count = len(t) if varying else 1
+            A, f = np.array([[-rate, 0.0], [1.0, -1.0]]), np.array([[rate], [0.0]])
+            return LinearEquation(None, np.tile(A, (count, 1, 1)), np.tile(f, (count, 1, 1)))
+
+        return LinearProblem(coefficients, np.ones((2, 1)), rate=rate)
+
+    mesh, found = Mesh(np.array([0.0, 0.1, 1.1, 3.1]), radau_rule(8)), []
+    for one in (problem(False), problem(True)):
+        noise = noise_of(mesh.steps, mesh.points, one.coefficients(mesh.points.ravel(), None))
+        found.append(kept_share(one, mesh, noise, np.ones((3, 9, 2, 1)))[:, :, 0])
+        slow = replace(one, rate=1.0)
+        assert (kept_share(slow, mesh, noise, np.ones((3, 9, 2, 1))) == 1.0).all()
+    alike, apart = found
+    np.testing.assert_allclose(apart[:, 0] * rate * mesh.steps, 1.0, atol=0.5)
+    assert (alike[:, 0] > 3.0 * apart[:, 0]).all()
+    assert (alike[:, 1] == 1.0).all()
+    assert (apart[:, 1] < 0.5).all()
+
+
+def test_elements_are_as_many_as_they_may_be_and_no_more():
+    """One is cut into four: that makes seven of four, and where it is, how bad, is said."""
+    def evaluate(mesh, found, kept):
+        there = (mesh.points[:, 0] == 1.0) & (mesh.steps > 0.5)
+        return found, np.where(there, 0.5, 0.0)
+
+    mesh, limits = Mesh(np.arange(5.0), radau_rule(4)), {"tol": 1e-2, "name": "law"}
+    assert refine(evaluate, mesh, max_elements=7, **limits)[0].size == 7
+    said = r"law is not resolved with 6 elements; worst near t = 1 \(tail 5\.0e-01\); raise solver"
+    with pytest.raises(SolverError, match=said):
+        refine(evaluate, mesh, max_elements=6, **limits)
+
+
 def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     """A wave that is as small and fast is resolved: cuts change nothing first, and then they do."""
     rule = radau_rule(14)
@@ -347,9 +387,13 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
 
     limits = {"tol": 1e-12, "max_elements": 200_000, "name": "signal"}
     on, sizes = evaluate(lambda t: noisy(t, t > 5.0) + 9 * (t > np.e))  # a jump is none
-    with pytest.raises(SolverError, match=r"near t = [5-9].*rounding in its .*solver\.tol above"):
+    said = r"near t = [5-9].*rounding in its equations is (\S+) of it.*solver\.tol above"
+    with pytest.raises(SolverError, match=said) as refusal:
         resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)
     assert max(sizes) < 5000
+    rounding = float(re.search(said, str(refusal.value))[1])
+    left = resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits | {"tol": 1.1 * rounding})[2]
+    assert 0.5 * rounding < left <= 1.1 * rounding
     on, sizes = evaluate(lambda t: noisy(t, 1e-5))
     assert 1e-6 < resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)[2] < 1e-3
     assert max(sizes) < 5000
