@@ -269,3 +269,35 @@ def test_terms_of_equations_are_the_sizes_of_what_they_are_the_sum_of(seed):
     rows = np.abs(np.broadcast_to(form.E1, (6, 3, 3))[2::3]) / [1, 2, 4]
     sizes = np.concatenate([np.abs(A) * t, known], axis=2)
     np.testing.assert_allclose(form.terms, rows @ sizes, rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("fast", [3.0, 1e5])
+def test_rates_of_the_differential_part_are_those_of_the_plant(fast, varying, unit):
+    """Index 3 in turned rows and states, by the derivative array or one stage after the other."""
+    rng = np.random.default_rng(1)
+    P, Q = (np.linalg.qr(rng.normal(size=(5, 5)))[0] for _ in "PQ")
+    E, A = np.diag([1.0, 1, 0, 0, 0]), np.diag([-fast, 0.7, 1, 1, 1])
+    E[2, 3] = E[3, 4] = 1.0
+    moves = f"*(1 + t/{100.0 * unit!r})" if varying else ""
+    structure = analyse(plant_from_mapping({
+        "name": "turned", "states": list("abcmn"), "E": (unit * P @ E @ Q).tolist(),
+        "A": [[f"{x!r}{moves}" for x in row] for row in (P @ A @ Q).tolist()],
+        "initial_state": [0] * 5,
+    }), 0.0, unit, max_mu=4, rank_tol=1e-10)
+    assert (structure.mu, structure.a, structure.d) == (2, 3, 2)
+    assert (len(structure.stages) > 0) == (fast > 100.0)
+    assert structure.growth * unit == pytest.approx(0.7, rel=0.011)
+    assert 1.0 < structure.rate * unit / fast < 1.2
+    assert structure.smallest_singular_value > 0.01
+
+
+def test_singular_values_of_a_stage_are_those_of_its_matrices():
+    """Of E, of orthonormal constraints, of E on their kernel; and a constraint's size."""
+    E, A = np.diag([2.0, 0.5, 0.0]), np.array([[1.0, 2, 3], [4, 5, 6], [0.3, 0, 0.4]])
+    found = in_stages(E[None, None], A[None, None], np.zeros((1, 1, 3, 0)), 1e-10, 1)
+    kernel = np.array([[0.8, 0.0], [0.0, 1.0], [-0.6, 0.0]])
+    least = np.linalg.svd(E @ kernel, compute_uv=False)[-1] / np.linalg.norm(E)
+    np.testing.assert_allclose(found.smallest, [[0.25, 1.0, least, 0.5]], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(found.A2), [[[0.6, 0.0, 0.8]]], atol=1e-15)
