@@ -137,6 +137,17 @@ def test_an_unannounced_singularity_is_an_error_that_names_the_time():
         solve(LinearProblem(singular, np.zeros((1, 1))), mesh, tol=1e-10, max_elements=2000)
 
 
+def test_elements_that_determine_nothing_are_refused_with_their_times():
+    def nothing(t, inside):
+        return LinearEquation(np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
+
+    problem = LinearProblem(nothing, np.ones((1, 1)), name="law")
+    mesh = Mesh(np.array([2.0, 3.0, 5.0]), radau_rule(4))
+    said = r"the law has a singular collocation system between t = 2 and 5;"
+    with pytest.raises(SolverError, match=said):
+        solve(problem, mesh, tol=1e-9, max_elements=9)
+
+
 def test_a_solution_that_overflows_is_an_error():
     mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
     constant = LinearEquation(None, np.full((1, 1, 1), 1e4), np.zeros((1, 1, 1)))

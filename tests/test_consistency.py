@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import one_state
+from processes import refused
 
 from benchmarks.honesty import made
 from gpebo_cli import load_plant
@@ -21,10 +22,17 @@ from gpebo_cli.reduction.scaling import balance, scales_of
 from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
+    _refuse_undetermined,
     forcing,
     strangeness_free_form,
 )
-from gpebo_cli.reduction.structure import _probe_times, analyse, without_equations
+from gpebo_cli.reduction.structure import (
+    _probe_times,
+    _refuse_crossing,
+    _why_not,
+    analyse,
+    without_equations,
+)
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start
 from gpebo_cli.simulation.simulate import simulate
@@ -301,3 +309,46 @@ def test_singular_values_of_a_stage_are_those_of_its_matrices():
     least = np.linalg.svd(E @ kernel, compute_uv=False)[-1] / np.linalg.norm(E)
     np.testing.assert_allclose(found.smallest, [[0.25, 1.0, least, 0.5]], rtol=1e-12)
     np.testing.assert_allclose(np.abs(found.A2), [[[0.6, 0.0, 0.8]]], atol=1e-15)
+
+
+def test_what_says_against_an_index_is_named_with_its_time():
+    """The singular value, and of which: dependent constraints first, then states without any."""
+    t, smallest = np.array([1.0, 2.5, 4.0]), np.ones((3, 3))
+    smallest[0, 0] = 0.0  # of the derivative array itself: its rank says what there is
+    assert _why_not(t, smallest, 1e-10) == ""
+    smallest[2, 2] = 1e-12
+    assert _why_not(t, smallest, 1e-10) == (
+        "some states are in no equation's derivative and in no constraint at t = 4 (singular "
+        "value 1.0e-12)")
+    smallest[1, 1] = 1e-11
+    said = "constraints are linearly dependent at t = 2.5 (singular value 1.0e-11)"
+    assert _why_not(t, smallest, 1e-10) == said
+
+
+@pytest.mark.parametrize(("max_mu", "said"), [
+    (0, "0 differentiations constraints are linearly dependent at t = 0.001"),
+    (2, "2 differentiations 4 constraints appear for 3 states (t = 0.001)"),
+])
+def test_an_equation_that_is_there_twice_is_refused_with_what_it_leads_to(max_mu, said):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "c"], "E": np.diag([1, 0, 0]).tolist(),
+        "A": [[-1, 1, 1], [0, 1, 1], [0, 1, 1]], "initial_state": [1, 1, 1],
+    })
+    with refused(said, by=ModelError):
+        analyse(plant, 0.0, 1.0, max_mu=max_mu, rank_tol=1e-10)
+
+
+def test_a_determinant_that_changes_its_sign_between_two_times_is_refused_where_it_is_zero():
+    plant = plant_from_mapping(one_state(E=[["(t - 0.3712)*(1 + t)"]]))
+    t = np.array([0.1, 0.2, 0.7, 0.9])
+    E = plant.coefficients.taylor(t, 0).E[0]
+    with refused("differential part changes at t = 0.3712 (det E changes its sign)", by=ModelError):
+        _refuse_crossing(plant, t, E)
+    _refuse_crossing(plant, t[2:], E[2:])
+
+
+def test_equations_that_leave_a_state_open_are_refused_with_the_first_time():
+    plant, t = plant_from_mapping(one_state()), np.array([0.5, 1.25, 2.0])
+    said = "plant p: the equations do not determine the state near t = 1.25"
+    with refused(said, by=ModelError):
+        _refuse_undetermined(plant, np.array([False, True, True]), t)
