@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
-from gpebo_cli.numerics.errors import judged_errors
+from gpebo_cli.numerics.errors import EPS, judged_errors, least_sizes
 from gpebo_cli.numerics.mesh import (
     Looked,
     Mesh,
@@ -486,3 +486,70 @@ def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
     errors = judged_errors(problem, 1e-12 * one[None], 1e-12 * one, 0 * one, size, 0 * one, size)
     assert not errors.vague(1e-9).any()
     assert errors.vague(1e-13)[:, 0].tolist() == [False, True]
+
+
+def column(*values):
+    return np.array(values)[:, None]
+
+
+def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
+    """Three components: a large one, one that is small beside it, one that rounding makes."""
+    own, made_of, one = column(1.0, 1e-5, 0.0), column(1.0, 1e-5, 0.5), np.ones((3, 1))
+    carried = np.array([[[1e-9], [2e-9], [0.0]], [[3e-9], [1e-9], [0.0]]])
+    parts = carried.max(axis=0), column(0.0, 0.0, 4e-9), own, column(0.0, 5e-9, 0.0), made_of
+    plain = LinearProblem(lambda t, inside: None, one, floor=column(0.0, 0.0, 1e-2))
+    in_units = replace(plain, floor=0.0, units=column(1.0, 1e-4, 1.0))
+    for problem, size, beside in (
+        (plain, column(1.0, 1e-3, 1e-2), column(1.0, 1e-3, 1e-2)),
+        (in_units, column(1.0, 1e-5, 0.5), column(1.0, 1e-4, 1.0)),
+    ):
+        errors = judged_errors(problem, carried, *parts)
+        np.testing.assert_allclose(errors.largest, column(3e-9, 7e-9, 4e-9), rtol=1e-5)
+        np.testing.assert_allclose(errors.own, size)
+        np.testing.assert_allclose(errors.beside, beside)
+        np.testing.assert_allclose(errors.relative, errors.largest / size)
+        np.testing.assert_allclose(errors.last, column(3e-9, 1e-9, 0.0))
+        assert errors.estimate == pytest.approx((errors.largest / size).max(), rel=1e-12)
+        assert errors.lost == 2
+        few = judged_errors(problem, carried, parts[0] + 1.0, *parts[1:])
+        assert few.estimate == pytest.approx((few.largest / beside).max(), rel=1e-12)
+
+
+def test_rounding_that_constraints_let_through_counts_up_to_what_is_seen_of_it():
+    """Of the first component 100 times into the second, and 50 times that of 1."""
+    amplification, one = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 50.0]]), np.ones((2, 1))
+    problem = LinearProblem(lambda t, inside: None, one, units=one, amplification=amplification)
+    own, none = column(3.0, 1.0), np.zeros((2, 1))
+
+    def through(problem, noise=none):
+        found = judged_errors(problem, none[None], none, none, own, noise, own).largest
+        base = replace(problem, amplification=None)
+        plain = judged_errors(base, none[None], none, none, own, noise, own).largest
+        return (found - plain) / EPS
+
+    np.testing.assert_allclose(through(problem), column(0.0, 350.0))
+    np.testing.assert_allclose(through(replace(problem, seen=7.0)), column(0.0, 7.0))
+    shown = through(replace(problem, seen=7.0), column(0.0, 20.0 * EPS))
+    assert 20.0 < shown[1, 0] < 350.0  # noise that shows may be smaller than what makes it
+    np.testing.assert_allclose(through(replace(problem, floor=column(5.0, 0.0))), column(0.0, 550))
+    least = least_sizes(problem, own, 1e-6)[:, 0]
+    assert least[0] == pytest.approx(3e-3)
+    assert least[1] == pytest.approx(1e-3)
+    assert least_sizes(problem, own, 1e-14)[1, 0] > 350.0 * EPS / 1e-14
+    np.testing.assert_allclose(least_sizes(replace(problem, units=None), own, 1e-6), 3e-3)
+    np.testing.assert_allclose(least_sizes(replace(problem, floor=0.1), own, 1e-6), 0.1)
+
+
+def test_errors_of_the_start_are_carried_with_the_solution():
+    def coefficients(t, inside):
+        return LinearEquation(None, np.array([[[-1.0, 0.0], [3.0, -1.0]]]), np.zeros((1, 2, 1)))
+
+    mesh, wrong = initial_mesh(0.0, 2.0, [], 8, radau_rule(8)), column(1e-6, 2e-6)
+    problem = LinearProblem(coefficients, np.ones((2, 1)), uncertain=wrong)
+    found = solve(problem, mesh, tol=1e-9, max_elements=20)
+    size = np.exp(-2.0) * np.array([1e-6, np.hypot(6e-6, 2e-6)])
+    np.testing.assert_allclose(found.uncertain[:, 0], size, rtol=1e-6)
+    largest = [1e-6 * np.exp(-0.25), max(np.exp(-t) * np.hypot(3e-6 * t, 2e-6)
+                                         for t in mesh.edges[1:])]
+    own = np.abs(found.trajectory.values).max(axis=(0, 1))
+    np.testing.assert_allclose((found.errors * own)[:, 0], largest, rtol=1e-5)
