@@ -504,6 +504,29 @@ def test_a_full_stiff_plant_of_index_2_agrees_with_its_modes():
     assert (wrong <= found.state_errors).all()
 
 
+@pytest.mark.parametrize(("build", "varying"), [
+    *((build, varying) for build in PLANTS for varying in (False, True)), (None, False),
+])
+def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
+    """Both ways, at the first time alone, and by sizes; of a full plant, too."""
+    blocks = saddle(48, 11, np.random.default_rng(4))
+    system = plant(build, varying=varying) if build else full_plant(*matrices(blocks))
+    mesh, rng = Mesh(np.array([0.5, 1.0, 2.0]), radau_rule(4)), np.random.default_rng(0)
+    form = large._Plant(system, 7).eliminate(mesh)
+    z = rng.normal(size=(mesh.points.size, form.d, 1))
+    x, known = (form.states_from(y)[:, :, 0] for y in (z, 0.0 * z))
+    np.testing.assert_allclose(form.reduced(x[0]) - form.reduced(known[0]), z[0, :, 0], atol=1e-13)
+    first = form.at_first().states_from(z[:1])[0, :, 0]
+    np.testing.assert_allclose(first, x[0], atol=1e-14 * np.abs(x).max())
+    made_of, moved = form.sizes_from(np.abs(z).max(axis=0))[:, 0], np.abs(x - known).max(axis=0)
+    assert (moved <= made_of * (1.0 + 1e-12) + 1e-14).all()
+    assert (made_of <= 15.0 * np.maximum(moved, 0.1)).all()
+    assert form.loss == (1.0 if build else pytest.approx(1.0 / form.pivot))
+    if build is None:
+        assert (np.abs(known) <= form.known).all()
+        assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
+
+
 def test_a_full_plant_of_index_3_is_the_sparse_one_in_other_coordinates():
     rng = np.random.default_rng(5)
     E, A, B, C = chain(27)
