@@ -333,6 +333,18 @@ def test_where_a_solution_ends_is_named_with_its_time_and_state(plant, near, pow
     assert not failed  # iterates that grow without bounds are not solved: that takes long
 
 
+def test_what_is_refused_beyond_the_end_of_a_solution_is_not_its_reason():
+    """x' = x² ends at t = 1; longer windows, tried before, came to a zero divisor at t = 2.5."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "s", "z"], "outputs": ["y", "w"], "E": np.eye(3).tolist(),
+        "A": [["y", 0, 0], [0, 0, 0], [0, 0, -1]], "phi": [0, 1, "1/(w - 2.5)"],
+        "C": [[1, 0, 0], [0, 1, 0]], "initial_state": [1, 0, 0],
+    })
+    said = r"beyond t = 0\.9999\d+ .* there\): Newton's method does not converge"
+    with pytest.raises(SolverError, match=said):
+        simulate(system, TimeSettings(horizon=3.0), SOLVER)
+
+
 @pytest.mark.parametrize(("half", "then", "slows"), [
     (0.998, [0.9985, 0.9988, 0.999], True),
     (0.95, [0.96, 0.98, 0.999], False),
