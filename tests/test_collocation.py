@@ -26,7 +26,8 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
-from gpebo_cli.numerics.rounding import kept_share, noise_of
+from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
+from gpebo_cli.simulation.known import cut_where, least_beside
 from tests.kernel_paths import by_both
 
 
@@ -368,6 +369,46 @@ def test_a_fast_mode_forgets_rounding_within_its_time(rate):
     assert (alike[:, 0] > 3.0 * apart[:, 0]).all()
     assert (alike[:, 1] == 1.0).all()
     assert (apart[:, 1] < 0.5).all()
+
+
+def test_a_wrong_instant_moves_a_solution_by_the_jump_of_its_slope():
+    """From 1 to 4 at t = 2, and from 2 to 1 in the other component; at t = 1 nothing happens."""
+    mesh = Mesh(np.array([0.0, 1.0, 2.0, 3.0]), radau_rule(4))
+    t, late = mesh.points, mesh.inside > 2.0
+    values = np.stack([np.where(late, 4 * t - 6, t), np.where(late, t, 2 * t - 2)], axis=-1)
+    problem = LinearProblem(lambda t, inside: None, np.ones((2, 1)), blur=lambda cuts: 5.0 * cuts)
+    solution = Trajectory(mesh, values[..., None])
+    found = noise_of_instants(problem, solution, np.array([1.0, 2.0]))[..., 0]
+    np.testing.assert_allclose(found, [[0, 0], [0, 0], [30, 10]], atol=1e-12)
+    assert not noise_of_instants(problem, solution, np.zeros(0)).any()
+
+
+def test_what_an_input_stands_beside_is_the_least_share_of_its_equations():
+    """Beside terms of 3, 8 and 1: the first input by 2 and 4 of them, the last in no equation."""
+    rows, columns = np.array([0, 1, 2, 2]), np.array([0, 0, 1, 0])
+    sizes = np.array([2.0, 4.0, 0.1, 0.0])
+    found = least_beside(np.array([3.0, 8.0, 1.0]), sizes, rows, columns, 3)
+    np.testing.assert_allclose(found, [1.5, 10.0, 0.0])
+
+
+@pytest.mark.parametrize(("tail", "tol", "most", "sizes"), [
+    (lambda h: h**4, 1e-4, 999, [2, 16, 32]),  # cuts help: until it is resolved,
+    (lambda h: 1e-3 + 0 * h, 1e-4, 99_999, [2, 6, 18, 54]),  # or some have not helped,
+    (lambda h: 1e-7 + 0 * h, 1e-9, 999, [2, 8]),  # or one where it may be rounding,
+    (lambda h: 1e-3 + 0 * h, 1e-4, 20, [2, 6, 18]),  # or there would be too many
+])
+def test_known_functions_are_cut_as_long_as_that_helps(tail, tol, most, sizes):
+    """What is found on the last mesh comes with it."""
+    found = []
+
+    def evaluated(mesh):
+        found.append(mesh.size)
+        return mesh.size
+
+    start = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
+    mesh, known = cut_where(lambda mesh, _: tail(mesh.steps), evaluated, start, 2, tol, most)
+    assert [2, *found] == sizes
+    assert known == mesh.size == sizes[-1]
 
 
 def test_elements_are_as_many_as_they_may_be_and_no_more():
