@@ -362,8 +362,8 @@ def test_a_fast_mode_forgets_rounding_within_its_time(rate):
     for one in (problem(False), problem(True)):
         noise = noise_of(mesh.steps, mesh.points, one.coefficients(mesh.points.ravel(), None))
         found.append(kept_share(one, mesh, noise, np.ones((3, 9, 2, 1)))[:, :, 0])
-        slow = replace(one, rate=1.0)
-        assert (kept_share(slow, mesh, noise, np.ones((3, 9, 2, 1))) == 1.0).all()
+        for slow in (replace(one, rate=1.0), replace(one, rate=LinearProblem.rate)):
+            assert (kept_share(slow, mesh, noise, np.ones((3, 9, 2, 1))) == 1.0).all()
     alike, apart = found
     np.testing.assert_allclose(apart[:, 0] * rate * mesh.steps, 1.0, atol=0.5)
     assert (alike[:, 0] > 3.0 * apart[:, 0]).all()

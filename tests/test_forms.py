@@ -306,6 +306,24 @@ def test_observers_of_the_current_state_take_the_same_form(observer):
     assert np.abs(result.errors["flow"][0, -1]) < 1e-6
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_derivatives_of_inputs_go_along_where_they_are_known(known):
+    """Those of outputs never do; of order zero there are values alone."""
+    system, t = plant_from_mapping(BOOST), np.linspace(0.1, 1.0, 5)
+    inputs = InputDerivatives.of_plant(system, np.array([True])) if known else None
+    signals = np.stack([0.5 + 0.1 * np.sin(3 * t), 18.0 + t], axis=1)
+    form = EquationForm.given(system, inputs, t, signals=signals)
+    for order in (0, 2):
+        along = form.along(t, t, signals, order)
+        assert along.shape == (order + 1, 5, 2)
+        np.testing.assert_array_equal(along[0], signals)
+        assert not along[1:, :, 1].any()
+        slopes = np.stack([0.3 * np.cos(3 * t), -0.45 * np.sin(3 * t)])[:order] * known
+        np.testing.assert_allclose(along[1:, :, 0], slopes, atol=1e-14)
+    with pytest.raises(ValueError, match="follow signals, and none are given"):
+        form.along(t, t, None, 0)
+
+
 def test_a_noisy_input_in_a_hidden_constraint_is_named():
     with pytest.raises(ConfigError, match=r"u4, a hidden constraint on i, is contains .* order 1"):
         observed(CAPACITORS, noisy=("u4",))
