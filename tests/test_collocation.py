@@ -184,6 +184,17 @@ def test_trajectory_samples_integrates_and_filters():
     # z' = −λ (z − s): check through its own integral equation.
     residual = filtered.values - rate * (signal.integral().values - filtered.integral().values)
     assert np.abs(residual).max() < 1e-11
+    # From a start of its own it differs by what decays.
+    start = np.array([2.0, -1.0])
+    decays = start * np.exp(-rate * (t - 0.5)[:, None])
+    np.testing.assert_allclose(signal.low_pass(rate, start)(t) - filtered(t), decays, atol=1e-12)
+    local, whole = signal.integral(local=True).values, signal.integral().values
+    np.testing.assert_allclose(local, whole - whole[:, :1], atol=1e-12)
+    truth = np.array([[np.sin(t), t**3], [np.cos(t), 3 * t**2], [-np.sin(t) / 2, 3 * t]])
+    np.testing.assert_allclose(signal.taylor(t, 2), np.moveaxis(truth, 2, 1), atol=1e-9)
+    np.testing.assert_allclose(signal.derivative()(t), truth[1].T, atol=1e-10)
+    assert (signal.final == signal.values[-1, -1]).all()
+    assert mesh.span == (0.5, 4.5)
 
 
 def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():

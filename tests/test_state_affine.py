@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,24 +77,49 @@ def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     assert 0.0 < effort.last_change <= SOLVER.tol
 
 
-@pytest.mark.parametrize("plant", [BOOST, one_state(phi=["-y - abs(y - 0.5)"])])
-def test_the_effort_is_what_was_solved(plant, monkeypatch):
-    """Each linear problem is an iterate, and costs by its digits; instants are met once more."""
+@pytest.mark.parametrize(("plant", "horizon", "several"), [
+    (BOOST, 3.0, False), (one_state(phi=["-y - abs(y - 0.5)"]), 3.0, False), (LORENZ, 1.5, True),
+])  # fmt: skip
+def test_the_effort_is_what_was_solved(plant, horizon, several, monkeypatch):
+    """Each linear problem is an iterate, and costs by its digits and window; instants once more.
+
+    Windows that led to nothing do not count, and at last the whole is solved.
+    """
     solved = []
 
     def counted(system, time, solver, solve):
         def kept(*arguments):
-            solved.append(arguments[2].tol)
+            _, window, settings, growth = arguments
+            solved.append((window.start, window.horizon, settings.tol, growth))
             return solve(*arguments)
 
         solved.clear()
         return follow(system, time, solver, kept)
 
     monkeypatch.setattr(simulation.simulate, "follow", counted)
-    effort = simulate(plant_from_mapping(plant), TimeSettings(horizon=3.0), SOLVER).effort
-    assert effort.windows == 1
-    assert effort.iterates == len(solved)
-    assert effort.linear_solves == pytest.approx(np.log(solved).sum() / np.log(SOLVER.tol))
+    found = simulate(plant_from_mapping(plant), TimeSettings(horizon=horizon), SOLVER)
+    windows = {start: length for start, length, _, growth in solved if growth < np.inf}
+    led = [(length, tol) for start, length, tol, growth in solved
+           if growth == np.inf or length == windows[start]]
+    assert found.effort.windows == len(windows)
+    assert (len(windows) > 1) == several
+    assert sum(windows.values()) == pytest.approx(horizon)
+    assert found.effort.iterates == len(led)
+    cost = sum(length * np.log(tol) for length, tol in led) / horizon / np.log(SOLVER.tol)
+    assert found.effort.linear_solves == pytest.approx(cost)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.5])
+def test_what_the_last_iterate_may_change_is_an_error_of_every_state(change, monkeypatch):
+    def changing(*arguments):
+        return replace(follow(*arguments), last_change=change)
+
+    monkeypatch.setattr(simulation.simulate, "follow", changing)
+    found = simulate(boost(), TimeSettings(horizon=0.5), SOLVER)
+    assert found.error_estimate == max(change, found.state_errors.max())
+    assert (found.state_errors == change).all() == (change > 0.0)
+    assert (found.state_errors > 0.0).all()
+    assert found.effort.last_change == change
 
 
 def test_a_run_says_what_newtons_method_cost():
