@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from plants import BOOST, LORENZ, shipped
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
+from units import drawn, in_units
 
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
@@ -304,6 +305,23 @@ def test_observers_of_the_current_state_take_the_same_form(observer):
     )
     assert np.abs(result.errors["leak"][0, -1]) < 1e-6
     assert np.abs(result.errors["flow"][0, -1]) < 1e-6
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(("plant", "derivatives"), [
+    (CAPACITORS, [(1, 3)]), (CRANE, [(1, 1), (2, 1)]), (LC_LOOP, [(1, 0)]), (PENDULUM, []),
+], ids=lambda p: p["name"] if isinstance(p, dict) else "")
+def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
+    plant, derivatives, unit
+):
+    start = dict(zip(plant["states"], plant["initial_state"], strict=True))
+    by = drawn(np.random.default_rng(2), plant_from_mapping(plant), decades=True)
+    made = in_units({**plant, "initial_state": start}, by._replace(time=unit))
+    system, t = plant_from_mapping(made), unit * np.linspace(0.0, 5.0, 17)
+    inputs = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
+    given = EquationForm.given(system, inputs, t)
+    found = strangeness_free(given, t, t, None, max_mu=4, rank_tol=1e-10)
+    assert list(found.derivatives) == derivatives
 
 
 @pytest.mark.parametrize("known", [False, True])
