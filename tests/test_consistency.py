@@ -18,7 +18,7 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.scaling import balance, scales_of
+from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
 from gpebo_cli.reduction.stages import UnclearError, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
@@ -202,6 +202,29 @@ def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     })
     x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
     np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)
+
+
+@settings(max_examples=20)
+@given(SEEDS, st.integers(3, 11))
+def test_scales_by_entries_are_those_of_matrices_and_rounding_changes_neither(seed, n):
+    """An entry of 1e-25 beside entries of one is not there."""
+    rng = np.random.default_rng(seed)
+    both = rng.normal(size=(2, n, n)) * (rng.random((2, n, n)) < 0.4)
+    both[1, range(n), range(n)] = both[1, :, 0] = both[1, -1] = 1.0  # all of them hang together
+    found = []
+    for nothing in (0.0, 1e-25):
+        both[:, 0, 1] = 0.0, nothing
+        (E, A), none, empty = both[:, None, None], np.zeros((1, 1, n, 0)), np.zeros((1, 1, 0))
+        found.append(balance(Coefficients(
+            E, A, none, none, none, empty, empty, np.zeros((1, 1, n)), none, none
+        )))
+        places = tuple(np.argwhere(both).T)
+        found.append(balance_entries(np.abs(both[places]), places, n))
+    there = np.abs(both) > 1e-20
+    scaled = [(both * s.rows[:, None] * s.columns / np.array([[[s.time]], [[1.0]]]))[there]
+              for s in found]
+    for one in scaled[1:]:  # factors are rounded to powers of two
+        assert (np.abs(np.log2(one / scaled[0])) <= 1.01).all()
 
 
 @settings(max_examples=20)
