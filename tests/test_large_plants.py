@@ -659,15 +659,19 @@ def test_elements_that_are_cut_may_have_more_entries():
     (lambda t: 1.0 / (t + 0.05), lambda t: np.log(20.0 * t + 1.0)),  # powers do not fall
     (lambda t: 30.0 * np.cos(60.0 * t), lambda t: 0.5 * np.sin(60.0 * t)),  # nor converge at first
 ])
-def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm):
+@pytest.mark.parametrize("elements", [6, 20])
+def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm, elements):
+    """On elements that are short enough, or are cut first; five are too few."""
     def coefficients(t, inside):
         A = np.zeros((len(t), 9, 9))
         A[:, range(9), range(9)] = rate(t)[:, None]
         return LinearEquation(None, A, np.zeros((len(t), 9, 0)))
 
     problem = LinearProblem(coefficients, np.ones((9, 2)), name="rates")
-    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(14))
-    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    mesh = initial_mesh(0.0, 2.0, [], elements, radau_rule(14))
+    known = coefficients(mesh.points.ravel(), mesh.inside.ravel())
+    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500, known=known)
+    assert series.solve_dense(problem, mesh, tol=1e-9, max_elements=5, known=known) is None
     t = np.linspace(0.0, 2.0, 31)
     error = np.abs(found.trajectory(t) / np.exp(logarithm(t))[:, None, None] - 1.0).max()
     assert error <= found.error_estimate * 10.0 <= 1e-6
