@@ -71,6 +71,13 @@ def test_a_consistent_state_is_returned_as_it_is(seed, nu, extra, scale):
     assert same.tolist() == x0.tolist()
 
 
+def test_a_start_that_numbers_do_not_tell_is_none():
+    found, structure, form = case(3, 2, 2)
+    x0 = found.system.initial_state + np.arange(1.0, found.system.n + 1.0)
+    assert np.isfinite(consistent_state(form, x0, structure.scaling.weights)).all()
+    assert np.isnan(consistent_state(form, x0, np.inf * structure.scaling.weights)).all()
+
+
 @settings(deadline=None, max_examples=40)
 @given(SEEDS, st.integers(1, 4), st.integers(0, 4), st.sampled_from([0, 1, 6]))
 def test_both_paths_start_from_the_same_state(seed, nu, extra, spread):

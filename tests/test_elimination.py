@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from gpebo_cli.numerics import series
 from gpebo_cli.numerics.elimination import StiffError, _residual, by_elimination
 from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.problem import LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.series import sparse
 
@@ -64,6 +66,15 @@ def test_pivots_that_harm_are_seen():
     A[0, 0, 0], A[0, 0, 1], A[0, 1, 0] = real / H[0] * (1.0 + 1e-13), 1.0, -1.0
     _, left = solved(sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
     assert left.max() > 1e-13
+
+    def equation(mesh):
+        return sparse(A), np.zeros((1, D, 1)), ()
+
+    problem, mesh = LinearProblem(None, np.ones((D, 1))), Mesh(np.array([0.0, H[0]]), RULE)
+    limits = {"units": np.ones(D), "tol": 1e-9, "max_elements": 99, "stiff": True}
+    assert series.solve(problem, equation, mesh, **limits | {"tol": 1e-13}) is None
+    A[0, 0, 0] *= 1.1
+    assert series.solve(problem, equation, mesh, **limits).error_estimate < 1e-6
 
 
 def test_what_elimination_fills_is_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -322,6 +323,24 @@ def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
     given = EquationForm.given(system, inputs, t)
     found = strangeness_free(given, t, t, None, max_mu=4, rank_tol=1e-10)
     assert list(found.derivatives) == derivatives
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differentiated(known):
+    """Tanks whose leak an input sets: the derivative of the other one is in a hidden constraint."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "f"], "inputs": {"u": "2 + sin(t)", "v": "cos(t)"},
+        "outputs": ["y"], "E": np.diag([1, 1, 0]).tolist(),
+        "A": [["-u", 0, 1], [0, -1, 1], [1, -1, 0]], "B": [[0, 1], [0, 0], [0, 0]],
+        "C": [[1, 0, 0]], "initial_state": [1, 1, 0],
+    })
+    t = np.linspace(0.0, 2.0, 17)
+    signals = np.stack([2.0 + np.sin(t), np.cos(t), 0.0 * t], axis=1)
+    inputs = InputDerivatives.of_plant(system, np.array([known, True]))
+    given = EquationForm.given(system, inputs, t, signals=signals)
+    refused = pytest.raises(ConfigError, match="derivatives of the input u, the equations contain")
+    with nullcontext() if known else refused:
+        strangeness_free(given, t, t, signals, max_mu=3, rank_tol=1e-10)
 
 
 @pytest.mark.parametrize("known", [False, True])

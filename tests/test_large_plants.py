@@ -24,6 +24,8 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.reduction import scaling
+from gpebo_cli.reduction.constant import constant_form
+from gpebo_cli.reduction.explicit import UndecidedError
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -145,6 +147,39 @@ def test_structure_start_and_solution_are_those_of_the_derivative_array(build, v
     assert (wrong < 10.0 * found.state_errors + 1e-12).all()
     assert found.state_errors.max() < 1e-8
     np.testing.assert_allclose(found.signals.outputs(t), dense.signals.outputs(t), atol=1e-8)
+
+
+@pytest.mark.parametrize("build", PLANTS)
+def test_the_structure_alone_is_that_of_the_derivative_array(build):
+    """By elimination; of few states by the array itself."""
+    system, settings = plant(build, varying=True), (TIME, SolverSettings())
+    one, other = large.structure_of(system, *settings), large.dense_structure(system, *settings)
+    assert (one.mu, one.a, one.d, one.time_invariant) == (other.mu, other.a, other.d, False)
+    assert one.reference.rank == 0 < other.reference.rank
+    assert large.structure_of(plant(build, cells=3), *settings).reference.rank > 0
+
+
+def star(cells):
+    """One algebraic state that is the sum of all others, and drives them."""
+    E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)
+    A[:, -1], A[-1, :-1], E[-1, -1], A[-1, -1] = 1.0, 1.0, 0.0, -2.0
+    return E, A, np.eye(cells + 1, 1), C
+
+
+@pytest.mark.parametrize(("system", "most"), [
+    (lambda: plant(source_on_a_node, u="sin(t) + step(t - 3)"), 999),  # a jump has an impulse
+    (lambda: plant(ladder), 7),  # elements
+    (lambda: plant(star, varying=True, cells=60), 999),  # elimination fills what is sparse
+])
+def test_what_series_are_not_made_for_is_left_to_the_derivative_array(system, most):
+    assert large.large_simulation(system(), TIME, SolverSettings(max_elements=most)) is None
+
+
+def test_indices_of_full_matrices_have_the_limit_of_differentiations():
+    E, A, *_ = chain(10)
+    assert constant_form(E, A, 2).mu == 2
+    with pytest.raises(UndecidedError):
+        constant_form(E, A, 1)
 
 
 def test_inputs_may_be_the_same_function():
