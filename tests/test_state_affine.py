@@ -241,6 +241,30 @@ def test_functions_of_outputs_from_python():
     assert not one.bounded
 
 
+def test_functions_of_outputs_from_python_may_have_hidden_constraints():
+    """The plant of index 2 above: derivatives along outputs are differences of functions."""
+    def A(t, u, y):
+        out = np.zeros((len(t), 3, 3), dtype=y.dtype)
+        out[:, 0, 0], out[:, 1, 0], out[:, 1, 1], out[:, [0, 2], [2, 0]] = -y[:, 0], y[:, 0], -1, 1
+        return out
+
+    def phi(t):
+        x1, x2, z = solution(t).T
+        return np.stack([np.cos(t) + x1 * x2 - z, -2 * np.sin(2 * t) - x1 * x2 + x2, -x1], axis=1)
+
+    def solution(t):
+        return np.stack([2 + np.sin(t), np.cos(2 * t), np.cos(3 * t)], axis=1)
+
+    system = system_from_functions(
+        "index 2", np.diag([1.0, 1, 0]), A, phi=phi, C=[[0, 1.0, 0]], initial_state=[2, 1, 0.3],
+        names=Names(outputs=["y"]),
+    )
+    t = np.linspace(0.0, 2.0, 21)
+    found = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-8))
+    np.testing.assert_allclose(found.signals.states(t), solution(t), atol=1e-9)
+    assert found.structure.index == 2
+
+
 def test_a_simulation_that_would_take_too_long_is_refused_on_the_way():
     with pytest.raises(SolverError, match="the simulation of 5000 s would take more computing"):
         simulate(lorenz(), TimeSettings(horizon=5000.0), SolverSettings(max_seconds=1.0))
