@@ -78,6 +78,14 @@ def ungrounded(cells):
     return E, A, B, C
 
 
+def tied(cells):
+    """Index 2: two capacitors side by side, of which the second is twice as large."""
+    E, A, B, C = ladder(cells)
+    E[1, 1], A[-1], B[:], A[0, -1], A[1, -1] = 2.0, 0.0, 0.0, 1.0, -1.0
+    A[-1, 0], A[-1, 1], B[cells, 0] = 1.0, -1.0, 1.0
+    return E, A, B, C
+
+
 def chain(cells):
     """Index 3: masses and springs, of which the last has its position prescribed."""
     n = 2 * cells + 1
@@ -105,7 +113,7 @@ def grid(cells):
     return E, A, B, C
 
 
-PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
+PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, tied, chain]
 
 
 def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1):
@@ -216,7 +224,8 @@ def test_errors_are_not_larger_than_they_are_said_to_be(build):
 
 @pytest.mark.parametrize("varying", [False, True])
 @pytest.mark.parametrize(("build", "rate"), [
-    *((build, 1.0) for build in (ladder, current_source, floating, chain, grid)), (ladder, 1e5),
+    *((build, 1.0) for build in (ladder, current_source, floating, tied, chain, grid)),
+    (ladder, 1e5),
 ])
 def test_a_change_of_units_and_signs_changes_nothing(build, rate, varying):
     """States, equations, time and the input: structure, start, solution, its errors, elements."""
@@ -277,6 +286,8 @@ def test_a_stiff_sparse_plant_is_as_wrong_as_it_says(build, rate, varying):
         wrong = np.abs(one.signals.states(t) - true).max(axis=0) / np.abs(true).max(axis=0)
         assert (wrong <= 3.0 * (one.state_errors + exact.state_errors)).all()
         assert wrong.max() < 1e-8
+    ratio = found.state_errors / dense.state_errors
+    assert 0.1 < ratio.min() <= ratio.max() < 2e3
 
 
 @pytest.mark.parametrize(("n", "varying"), [(41, True), (41, False), (101, True)])
