@@ -116,7 +116,7 @@ def grid(cells):
 PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, tied, chain]
 
 
-def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1):
+def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1, **more):
     E, A, B, C = build(cells)
     n = len(E)
 
@@ -130,7 +130,7 @@ def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, i
         "outputs": ["y1", "y2"], "E": text(E, "1 + 0.3*cos(t + {})"),
         "A": text(rate * A, f"1 + 0.2*sin({swing}*t + {{}})"),
         "B": np.repeat(B / inputs, inputs, axis=1).tolist(), "C": C.tolist(),
-        "initial_state": [1.0, 0.5, *[0.1] * (n - 2)],
+        "initial_state": [1.0, 0.5, *[0.1] * (n - 2)], **more,
     })
 
 
@@ -144,7 +144,12 @@ def both(system, tol=1e-9):
 @pytest.mark.parametrize("varying", [False, True])
 @pytest.mark.parametrize("build", PLANTS)
 def test_structure_start_and_solution_are_those_of_the_derivative_array(build, varying):
-    found, dense = both(plant(build, varying=varying))
+    known = np.arange(len(build(CELLS)[0])) == CELLS + 1  # further terms, in one equation
+    found, dense = both(plant(
+        build, varying=varying, unknowns={"w": 0.3, "v": -2.0}, D=[[0.5], ["cos(t)"]],
+        F=[["1 + sin(t)", 0.2] if here else [0, 0] for here in known], H=[[0, 2], ["t", 0]],
+        phi=["cos(2*t)" if here else 0 for here in known],
+    ))
     one, other = found.structure, dense.structure
     assert (one.index, one.mu, one.a, one.d) == (other.index, other.mu, other.a, other.d)
     np.testing.assert_allclose(found.initial_state, dense.initial_state, atol=1e-13)
