@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -255,9 +256,12 @@ def test_a_state_that_vanishes_and_returns_is_not_lost():
 
 def test_growth_is_lost_when_its_rounding_is_as_large_as_the_state():
     """x' = (x − sin t)/2 + cos t is sin t beside 1e-17 e^{t/2}, and not what that has become."""
-    plant = scalar("0.5", 0.0, "cos(t) - 0.5*sin(t)")
-    with pytest.raises(SolverError, match=r"larger than a state from t = [567]\d\."):
-        simulate(plant, TimeSettings(horizon=200.0), SolverSettings())
+    plant, told = scalar("0.5", 0.0, "cos(t) - 0.5*sin(t)"), []
+    for horizon in (200.0, 2000.0):  # up to 1e26, and beyond all numbers
+        with pytest.raises(SolverError, match=r"larger than a state from t = [567]\d\.") as lost:
+            simulate(plant, TimeSettings(horizon=horizon), SolverSettings())
+        told.append(float(re.search(r"from t = (\S+) on", str(lost.value))[1]))
+    assert told[1] == pytest.approx(told[0], abs=3.0)
 
 
 @pytest.mark.parametrize(

@@ -608,7 +608,7 @@ def test_settings_out_of_all_proportion_are_named(said, settings):
 @pytest.mark.parametrize(
     ("rate", "solver", "why"),
     [
-        ("500*(t-10)", "collocation", r"rounding errors are larger than a state from t = 1\d\.\d"),
+        ("500*(t-10)", "collocation", r"rounding errors are larger than a state from t = 11\.6"),
         ("20*(t-10)", "collocation", r"rounding errors are larger than a state from t = 18\.[34]"),
         ("200", "collocation", r"not finite from t = 3\.5\d+ on: it grows beyond all numbers"),
         ("-1.0e5*cos(t)", "ivp", r"near t = 0\.0\d+ the plant p takes more steps"),
