@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -576,6 +576,21 @@ def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
     if build is None:
         assert (np.abs(known) <= form.known).all()
         assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
+
+
+def test_a_full_plant_starts_from_the_nearest_state():
+    """‖M (v − v₀)‖ is least with J v = 0, and p follows from the derivative of that."""
+    rng = np.random.default_rng(4)
+    M, K, J, b = blocks = saddle(48, 11, rng)
+    x0, system = rng.normal(size=59), full_plant(*matrices(blocks), u="cos(3*t)")
+    grown = large._Plant(replace(system, initial_state=x0), 7)
+    grown.eliminate(Mesh(np.array([0.0, 1.0]), radau_rule(4)))
+    x, _ = large._start(grown)
+    free = null_space(J)
+    v = free @ np.linalg.lstsq(M @ free, M @ x0[:48], rcond=None)[0]
+    p = np.linalg.solve(J @ np.linalg.solve(M, J.T), J @ np.linalg.solve(M, K @ v - b))
+    np.testing.assert_allclose(x[:48], v, atol=1e-10)
+    np.testing.assert_allclose(x[48:], p, atol=1e-9 * np.abs(p).max())
 
 
 def test_a_full_plant_of_index_3_is_the_sparse_one_in_other_coordinates():
