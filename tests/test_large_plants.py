@@ -227,6 +227,15 @@ def test_errors_are_not_larger_than_they_are_said_to_be(build):
         assert (off <= 10.0 * found.state_errors * np.abs(true).max(axis=0)).all()
 
 
+def test_a_state_that_an_input_gives_is_as_wrong_as_polynomials_leave_it():
+    """x0 = u: nothing is integrated for it."""
+    system = plant(source_on_a_node, u="exp(-((t - 4)/0.3)**2)")
+    found = large.large_simulation(system, TIME, SolverSettings(tol=1e-4, stages=5))
+    t = np.linspace(0.0, TIME.horizon, 2001)
+    wrong = np.abs(found.signals.states(t)[:, 0] - np.exp(-(((t - 4) / 0.3) ** 2))).max()
+    assert 1e-7 < wrong < found.state_errors[0] < 1e-3
+
+
 @pytest.mark.parametrize("varying", [False, True])
 @pytest.mark.parametrize(("build", "rate"), [
     *((build, 1.0) for build in (ladder, current_source, floating, tied, chain, grid)),
