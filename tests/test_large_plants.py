@@ -587,6 +587,18 @@ def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
         assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
 
 
+def test_a_full_plant_that_nothing_drives():
+    rng = np.random.default_rng(8)
+    E, A = np.linalg.qr(rng.normal(size=(51, 51)))[0], rng.normal(size=(51, 51)) / 9.0
+    system = load_plant({
+        "name": "free", "states": [f"x{k}" for k in range(51)], "E": E.tolist(), "A": A.tolist(),
+        "initial_state": [1.0] * 51,
+    })
+    found = large.large_simulation(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+    end = expm(2.0 * E.T @ A) @ np.ones(51)
+    np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
+
+
 def test_a_full_plant_starts_from_the_nearest_state():
     """‖M (v − v₀)‖ is least with J v = 0, and p follows from the derivative of that."""
     rng = np.random.default_rng(4)

@@ -327,17 +327,21 @@ def test_an_output_may_switch_together_with_a_function_of_time():
     assert error.max() < 1e-11
 
 
-@pytest.mark.parametrize(("width", "where", "horizon"), [(3e-4, 1.7, 2.0), (1e-4, 1.1, 1.5)])
-def test_a_narrow_pulse_that_an_output_passes_is_seen(width, where, horizon):
+@pytest.mark.parametrize(("width", "where", "horizon", "unit"), [
+    (3e-4, 1.7, 2.0, 1.0), (1e-4, 1.1, 1.5, 1e12),
+])
+def test_a_narrow_pulse_that_an_output_passes_is_seen(width, where, horizon, unit):
     """In a closer look along the solution; an iterate that is not finite warns of nothing."""
-    pulse = f"exp(-((y - {where})/{width})**2)"
+    pulse = f"{unit}*exp(-((y - {where})/{width})**2)"
     system = plant_from_mapping({
         "name": "pulse", "states": ["s", "x"], "outputs": ["y"], "E": [[1, 0], [0, 1]],
         "A": [[0, 0], [0, 0]], "phi": ["1 + 0.1*sin(y)", f"{pulse}*(1 + 0.1*sin(y))"],
         "C": [[1, 0]], "initial_state": [0, 0],
     })
     found = simulate(system, TimeSettings(horizon=horizon), SolverSettings(tol=1e-9))
-    assert found.signals.states.final[1] == pytest.approx(width * np.sqrt(np.pi), rel=1e-8)
+    area = found.signals.states.final[1] / unit
+    assert area == pytest.approx(width * np.sqrt(np.pi), rel=1e-8)
+    assert found.bounded
 
 
 def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
