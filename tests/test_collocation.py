@@ -193,6 +193,12 @@ def test_trajectory_samples_integrates_and_filters():
     truth = np.array([[np.sin(t), t**3], [np.cos(t), 3 * t**2], [-np.sin(t) / 2, 3 * t]])
     np.testing.assert_allclose(signal.taylor(t, 2), np.moveaxis(truth, 2, 1), atol=1e-9)
     np.testing.assert_allclose(signal.derivative()(t), truth[1].T, atol=1e-10)
+    low, high = np.array([0.6, 2.0]), np.array([0.8, 2.1])
+    value, slope, *_ = Trajectory(mesh, 2.0 * mesh.points[..., None]).cells(low, high)[0]
+    np.testing.assert_allclose([value.low, value.high], [2.0 * low, 2.0 * high])
+    np.testing.assert_allclose([slope.low, slope.high], 2.0)
+    for cells, values in zip(signal.cells(low, high), signal(np.array([0.7, 2.03])).T, strict=True):
+        assert ((cells[0].low < values) & (values < cells[0].high)).all()
     assert (signal.final == signal.values[-1, -1]).all()
     assert mesh.span == (0.5, 4.5)
 
