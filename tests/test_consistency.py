@@ -19,7 +19,7 @@ from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
 from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
-from gpebo_cli.reduction.stages import UnclearError, in_stages
+from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
     _refuse_undetermined,
@@ -339,6 +339,13 @@ def test_singular_values_of_a_stage_are_those_of_its_matrices():
     least = np.linalg.svd(E @ kernel, compute_uv=False)[-1] / np.linalg.norm(E)
     np.testing.assert_allclose(found.smallest, [[0.25, 1.0, least, 0.5]], rtol=1e-12)
     np.testing.assert_allclose(np.abs(found.A2), [[[0.6, 0.0, 0.8]]], atol=1e-15)
+
+
+def test_how_fast_coefficients_move_is_the_largest_slope_beside_its_size():
+    model = np.zeros((3, 2, 4, 2, 2))
+    model[:, 0], model[0, 1], model[1, 1] = 2.0, 6.0, -4.0
+    assert _Rounding(*model, 1).rate == 3.0
+    assert _Rounding(*model[:, :1], 1).rate == 0.0  # no slopes are known
 
 
 def test_what_says_against_an_index_is_named_with_its_time():
