@@ -211,7 +211,7 @@ def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)
 
 
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(SEEDS, st.integers(3, 11))
 def test_scales_by_entries_are_those_of_matrices_and_rounding_changes_neither(seed, n):
     """An entry of 1e-25 beside entries of one is not there."""
