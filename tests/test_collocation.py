@@ -519,6 +519,15 @@ def test_elements_as_short_as_times_are_told_apart_say_why(start, said):
         refine(evaluate, mesh, tol=1e-9, max_elements=10_000, name="plant p")
 
 
+def test_a_short_element_that_need_not_be_cut_is_no_reason_to_refuse():
+    """Of 1e-6 s at 1e9 s, where times are told apart to 1e-7 s; the one before it is cut."""
+    def evaluate(mesh, found, kept):
+        return found, np.where(mesh.steps > 0.4, 0.5, 0.0)
+
+    mesh = Mesh(1e9 + np.array([0.0, 0.5, 0.5 + 1e-6]), radau_rule(4))
+    assert refine(evaluate, mesh, tol=1e-2, max_elements=9, name="law")[0].size == 5
+
+
 def test_signals_in_units_are_as_well_resolved_as_without():
     """Three waves, of which the slow one is seen to be resolved in none but its own unit."""
     rule, units = radau_rule(8), np.array([1e-7, 1.0, 1e5])
