@@ -179,6 +179,17 @@ def test_scalings_undo_units(seed, n, of_E):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
 
 
+@pytest.mark.parametrize("common", np.geomspace(1.0, 10.0, 7))
+def test_equations_within_a_decade_count_as_they_were_written(common):
+    """And one that is a thousand times as large counts a thousandth, whatever all are in."""
+    rows = common * np.array([1.0, 1.5, 0.6, 1e3])
+    E, A = rows[:, None] * np.eye(4), rows[:, None] * (np.ones((4, 4)) + np.eye(4))
+    none, empty = np.zeros((1, 1, 4, 0)), np.zeros((1, 1, 0))
+    c = Coefficients(E[None, None], A[None, None], none, none, none, empty, empty,
+                     np.zeros((1, 1, 4)), none, none)
+    np.testing.assert_allclose(balance(c).weights, [1.0, 1.0, 1.0, 1e-3])
+
+
 def test_no_piece_between_jumps_goes_unprobed():
     """A rank may be lost in one of many short pieces alone."""
     plant = plant_from_mapping(one_state(A=[["sign(sin(150*t)) - 2"]]))
@@ -329,6 +340,7 @@ def test_rates_of_the_differential_part_are_those_of_the_plant(fast, varying, un
     assert structure.growth * unit == pytest.approx(0.7, rel=0.011)
     assert 1.0 < structure.rate * unit / fast < 1.2
     assert structure.smallest_singular_value > 0.01
+    assert structure.steady or varying
 
 
 def test_singular_values_of_a_stage_are_those_of_its_matrices():
