@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +14,7 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
-from gpebo_cli.numerics.errors import judged_errors
+from gpebo_cli.numerics.errors import EPS, judged_errors, least_sizes
 from gpebo_cli.numerics.mesh import (
     Looked,
     Mesh,
@@ -23,7 +26,8 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import differentiation_schur, radau_rule
 from gpebo_cli.numerics.refinement import refine, resolve
-from gpebo_cli.numerics.rounding import noise_of
+from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
+from gpebo_cli.simulation.known import cut_where, least_beside
 from tests.kernel_paths import by_both
 
 
@@ -134,6 +138,17 @@ def test_an_unannounced_singularity_is_an_error_that_names_the_time():
         solve(LinearProblem(singular, np.zeros((1, 1))), mesh, tol=1e-10, max_elements=2000)
 
 
+def test_elements_that_determine_nothing_are_refused_with_their_times():
+    def nothing(t, inside):
+        return LinearEquation(np.zeros((1, 1, 1)), np.zeros((1, 1, 1)), np.zeros((1, 1, 1)))
+
+    problem = LinearProblem(nothing, np.ones((1, 1)), name="law")
+    mesh = Mesh(np.array([2.0, 3.0, 5.0]), radau_rule(4))
+    said = r"the law has a singular collocation system between t = 2 and 5;"
+    with pytest.raises(SolverError, match=said):
+        solve(problem, mesh, tol=1e-9, max_elements=9)
+
+
 def test_a_solution_that_overflows_is_an_error():
     mesh = initial_mesh(0.0, 1.0, [], 8, radau_rule(9))
     constant = LinearEquation(None, np.full((1, 1, 1), 1e4), np.zeros((1, 1, 1)))
@@ -169,6 +184,23 @@ def test_trajectory_samples_integrates_and_filters():
     # z' = −λ (z − s): check through its own integral equation.
     residual = filtered.values - rate * (signal.integral().values - filtered.integral().values)
     assert np.abs(residual).max() < 1e-11
+    # From a start of its own it differs by what decays.
+    start = np.array([2.0, -1.0])
+    decays = start * np.exp(-rate * (t - 0.5)[:, None])
+    np.testing.assert_allclose(signal.low_pass(rate, start)(t) - filtered(t), decays, atol=1e-12)
+    local, whole = signal.integral(local=True).values, signal.integral().values
+    np.testing.assert_allclose(local, whole - whole[:, :1], atol=1e-12)
+    truth = np.array([[np.sin(t), t**3], [np.cos(t), 3 * t**2], [-np.sin(t) / 2, 3 * t]])
+    np.testing.assert_allclose(signal.taylor(t, 2), np.moveaxis(truth, 2, 1), atol=1e-9)
+    np.testing.assert_allclose(signal.derivative()(t), truth[1].T, atol=1e-10)
+    low, high = np.array([0.6, 2.0]), np.array([0.8, 2.1])
+    value, slope, *_ = Trajectory(mesh, 2.0 * mesh.points[..., None]).cells(low, high)[0]
+    np.testing.assert_allclose([value.low, value.high], [2.0 * low, 2.0 * high])
+    np.testing.assert_allclose([slope.low, slope.high], 2.0)
+    for cells, values in zip(signal.cells(low, high), signal(np.array([0.7, 2.03])).T, strict=True):
+        assert ((cells[0].low < values) & (values < cells[0].high)).all()
+    assert (signal.final == signal.values[-1, -1]).all()
+    assert mesh.span == (0.5, 4.5)
 
 
 def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():
@@ -332,6 +364,83 @@ def test_rounding_of_times_moves_what_varies_by_their_size():
     assert truth < noise_of(t[-1:], t[None], swing)[0, 0, 0] < 2 * truth
 
 
+@pytest.mark.parametrize("rate", [1e4, 1e8])
+def test_a_fast_mode_forgets_rounding_within_its_time(rate):
+    """In an element of length h all but 1/(λ h); what is the same at all nodes is not averaged."""
+    def problem(varying):
+        def coefficients(t, inside):
+            count = len(t) if varying else 1
+            A, f = np.array([[-rate, 0.0], [1.0, -1.0]]), np.array([[rate], [0.0]])
+            return LinearEquation(None, np.tile(A, (count, 1, 1)), np.tile(f, (count, 1, 1)))
+
+        return LinearProblem(coefficients, np.ones((2, 1)), rate=rate)
+
+    mesh, found = Mesh(np.array([0.0, 0.1, 1.1, 3.1]), radau_rule(8)), []
+    for one in (problem(False), problem(True)):
+        noise = noise_of(mesh.steps, mesh.points, one.coefficients(mesh.points.ravel(), None))
+        found.append(kept_share(one, mesh, noise, np.ones((3, 9, 2, 1)))[:, :, 0])
+        for slow in (replace(one, rate=1.0), replace(one, rate=LinearProblem.rate)):
+            assert (kept_share(slow, mesh, noise, np.ones((3, 9, 2, 1))) == 1.0).all()
+    alike, apart = found
+    np.testing.assert_allclose(apart[:, 0] * rate * mesh.steps, 1.0, atol=0.5)
+    assert (alike[:, 0] > 3.0 * apart[:, 0]).all()
+    assert (alike[:, 1] == 1.0).all()
+    assert (apart[:, 1] < 0.5).all()
+
+
+def test_a_wrong_instant_moves_a_solution_by_the_jump_of_its_slope():
+    """From 1 to 4 at t = 2, and from 2 to 1 in the other component; at t = 1 nothing happens."""
+    mesh = Mesh(np.array([0.0, 1.0, 2.0, 3.0]), radau_rule(4))
+    t, late = mesh.points, mesh.inside > 2.0
+    values = np.stack([np.where(late, 4 * t - 6, t), np.where(late, t, 2 * t - 2)], axis=-1)
+    problem = LinearProblem(lambda t, inside: None, np.ones((2, 1)), blur=lambda cuts: 5.0 * cuts)
+    solution = Trajectory(mesh, values[..., None])
+    found = noise_of_instants(problem, solution, np.array([1.0, 2.0]))[..., 0]
+    np.testing.assert_allclose(found, [[0, 0], [0, 0], [30, 10]], atol=1e-12)
+    assert not noise_of_instants(problem, solution, np.zeros(0)).any()
+
+
+def test_what_an_input_stands_beside_is_the_least_share_of_its_equations():
+    """Beside terms of 3, 8 and 1: the first input by 2 and 4 of them, the last in no equation."""
+    rows, columns = np.array([0, 1, 2, 2]), np.array([0, 0, 1, 0])
+    sizes = np.array([2.0, 4.0, 0.1, 0.0])
+    found = least_beside(np.array([3.0, 8.0, 1.0]), sizes, rows, columns, 3)
+    np.testing.assert_allclose(found, [1.5, 10.0, 0.0])
+
+
+@pytest.mark.parametrize(("tail", "tol", "most", "sizes"), [
+    (lambda h: h**4, 1e-4, 999, [2, 16, 32]),  # cuts help: until it is resolved,
+    (lambda h: 1e-3 + 0 * h, 1e-4, 99_999, [2, 6, 18, 54]),  # or some have not helped,
+    (lambda h: 1e-7 + 0 * h, 1e-9, 999, [2, 8]),  # or one where it may be rounding,
+    (lambda h: 1e-3 + 0 * h, 1e-4, 20, [2, 6, 18]),  # or there would be too many
+])
+def test_known_functions_are_cut_as_long_as_that_helps(tail, tol, most, sizes):
+    """What is found on the last mesh comes with it."""
+    found = []
+
+    def evaluated(mesh):
+        found.append(mesh.size)
+        return mesh.size
+
+    start = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
+    mesh, known = cut_where(lambda mesh, _: tail(mesh.steps), evaluated, start, 2, tol, most)
+    assert [2, *found] == sizes
+    assert known == mesh.size == sizes[-1]
+
+
+def test_elements_are_as_many_as_they_may_be_and_no_more():
+    """One is cut into four: that makes seven of four, and where it is, how bad, is said."""
+    def evaluate(mesh, found, kept):
+        there = (mesh.points[:, 0] == 1.0) & (mesh.steps > 0.5)
+        return found, np.where(there, 0.5, 0.0)
+
+    mesh, limits = Mesh(np.arange(5.0), radau_rule(4)), {"tol": 1e-2, "name": "law"}
+    assert refine(evaluate, mesh, max_elements=7, **limits)[0].size == 7
+    said = r"law is not resolved with 6 elements; worst near t = 1 \(tail 5\.0e-01\); raise solver"
+    with pytest.raises(SolverError, match=said):
+        refine(evaluate, mesh, max_elements=6, **limits)
+
+
 def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     """A wave that is as small and fast is resolved: cuts change nothing first, and then they do."""
     rule = radau_rule(14)
@@ -347,15 +456,36 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
 
     limits = {"tol": 1e-12, "max_elements": 200_000, "name": "signal"}
     on, sizes = evaluate(lambda t: noisy(t, t > 5.0) + 9 * (t > np.e))  # a jump is none
-    with pytest.raises(SolverError, match=r"near t = [5-9].*rounding in its .*solver\.tol above"):
+    said = r"near t = [5-9].*rounding in its equations is (\S+) of it.*solver\.tol above"
+    with pytest.raises(SolverError, match=said) as refusal:
         resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)
     assert max(sizes) < 5000
+    rounding = float(re.search(said, str(refusal.value))[1])
+    left = resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits | {"tol": 1.1 * rounding})[2]
+    assert 0.5 * rounding < left <= 1.1 * rounding
     on, sizes = evaluate(lambda t: noisy(t, 1e-5))
     assert 1e-6 < resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)[2] < 1e-3
     assert max(sizes) < 5000
     on, sizes = evaluate(lambda t: np.sin(3 * t) + 1e-4 * np.sin(3e4 * t))
     assert resolve(on, initial_mesh(0.0, 10.0, [], 24, rule), **limits)[2] < 1e-12
     assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding
+
+
+def test_a_transient_beside_rounding_is_resolved():
+    """Tails of 1e-5 differ from time to time, and one of 0.4 falls in elements below 1e-6 only."""
+    calls = []
+
+    def evaluate(mesh, found, kept):
+        calls.append(mesh.size)
+        there = (mesh.edges[:-1] <= 0.3) & (mesh.edges[1:] > 0.3)
+        transient = 0.4 * (mesh.steps > 1e-6)
+        return found, np.where(there, transient, 1e-5 * (1 + len(calls) % 2))
+
+    mesh, limits = Mesh(np.linspace(0.0, 1.0, 25), radau_rule(8)), {"tol": 1e-9, "name": "law"}
+    mesh, _, tail = refine(evaluate, mesh, max_elements=99_999, **limits)
+    assert tail.max() <= 2e-5
+    assert mesh.steps.min() < 1e-6
+    assert mesh.size < 24 * 8 * 8 + 100
 
 
 def test_a_short_element_keeps_the_digits_of_equations_without_derivatives():
@@ -387,6 +517,15 @@ def test_elements_as_short_as_times_are_told_apart_say_why(start, said):
     mesh = Mesh(start + np.array([0.0, 0.5, 1.0]), radau_rule(4))
     with pytest.raises(SolverError, match=said):
         refine(evaluate, mesh, tol=1e-9, max_elements=10_000, name="plant p")
+
+
+def test_a_short_element_that_need_not_be_cut_is_no_reason_to_refuse():
+    """Of 1e-6 s at 1e9 s, where times are told apart to 1e-7 s; the one before it is cut."""
+    def evaluate(mesh, found, kept):
+        return found, np.where(mesh.steps > 0.4, 0.5, 0.0)
+
+    mesh = Mesh(1e9 + np.array([0.0, 0.5, 0.5 + 1e-6]), radau_rule(4))
+    assert refine(evaluate, mesh, tol=1e-2, max_elements=9, name="law")[0].size == 5
 
 
 def test_signals_in_units_are_as_well_resolved_as_without():
@@ -431,3 +570,70 @@ def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
     errors = judged_errors(problem, 1e-12 * one[None], 1e-12 * one, 0 * one, size, 0 * one, size)
     assert not errors.vague(1e-9).any()
     assert errors.vague(1e-13)[:, 0].tolist() == [False, True]
+
+
+def column(*values):
+    return np.array(values)[:, None]
+
+
+def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
+    """Three components: a large one, one that is small beside it, one that rounding makes."""
+    own, made_of, one = column(1.0, 1e-5, 0.0), column(1.0, 1e-5, 0.5), np.ones((3, 1))
+    carried = np.array([[[1e-9], [2e-9], [0.0]], [[3e-9], [1e-9], [0.0]]])
+    parts = carried.max(axis=0), column(0.0, 0.0, 4e-9), own, column(0.0, 5e-9, 0.0), made_of
+    plain = LinearProblem(lambda t, inside: None, one, floor=column(0.0, 0.0, 1e-2))
+    in_units = replace(plain, floor=0.0, units=column(1.0, 1e-4, 1.0))
+    for problem, size, beside in (
+        (plain, column(1.0, 1e-3, 1e-2), column(1.0, 1e-3, 1e-2)),
+        (in_units, column(1.0, 1e-5, 0.5), column(1.0, 1e-4, 1.0)),
+    ):
+        errors = judged_errors(problem, carried, *parts)
+        np.testing.assert_allclose(errors.largest, column(3e-9, 7e-9, 4e-9), rtol=1e-5)
+        np.testing.assert_allclose(errors.own, size)
+        np.testing.assert_allclose(errors.beside, beside)
+        np.testing.assert_allclose(errors.relative, errors.largest / size)
+        np.testing.assert_allclose(errors.last, column(3e-9, 1e-9, 0.0))
+        assert errors.estimate == pytest.approx((errors.largest / size).max(), rel=1e-12)
+        assert errors.lost == 2
+        few = judged_errors(problem, carried, parts[0] + 1.0, *parts[1:])
+        assert few.estimate == pytest.approx((few.largest / beside).max(), rel=1e-12)
+
+
+def test_rounding_that_constraints_let_through_counts_up_to_what_is_seen_of_it():
+    """Of the first component 100 times into the second, and 50 times that of 1."""
+    amplification, one = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 50.0]]), np.ones((2, 1))
+    problem = LinearProblem(lambda t, inside: None, one, units=one, amplification=amplification)
+    own, none = column(3.0, 1.0), np.zeros((2, 1))
+
+    def through(problem, noise=none):
+        found = judged_errors(problem, none[None], none, none, own, noise, own).largest
+        base = replace(problem, amplification=None)
+        plain = judged_errors(base, none[None], none, none, own, noise, own).largest
+        return (found - plain) / EPS
+
+    np.testing.assert_allclose(through(problem), column(0.0, 350.0))
+    np.testing.assert_allclose(through(replace(problem, seen=7.0)), column(0.0, 7.0))
+    shown = through(replace(problem, seen=7.0), column(0.0, 20.0 * EPS))
+    assert 20.0 < shown[1, 0] < 350.0  # noise that shows may be smaller than what makes it
+    np.testing.assert_allclose(through(replace(problem, floor=column(5.0, 0.0))), column(0.0, 550))
+    least = least_sizes(problem, own, 1e-6)[:, 0]
+    assert least[0] == pytest.approx(3e-3)
+    assert least[1] == pytest.approx(1e-3)
+    assert least_sizes(problem, own, 1e-14)[1, 0] > 350.0 * EPS / 1e-14
+    np.testing.assert_allclose(least_sizes(replace(problem, units=None), own, 1e-6), 3e-3)
+    np.testing.assert_allclose(least_sizes(replace(problem, floor=0.1), own, 1e-6), 0.1)
+
+
+def test_errors_of_the_start_are_carried_with_the_solution():
+    def coefficients(t, inside):
+        return LinearEquation(None, np.array([[[-1.0, 0.0], [3.0, -1.0]]]), np.zeros((1, 2, 1)))
+
+    mesh, wrong = initial_mesh(0.0, 2.0, [], 8, radau_rule(8)), column(1e-6, 2e-6)
+    problem = LinearProblem(coefficients, np.ones((2, 1)), uncertain=wrong)
+    found = solve(problem, mesh, tol=1e-9, max_elements=20)
+    size = np.exp(-2.0) * np.array([1e-6, np.hypot(6e-6, 2e-6)])
+    np.testing.assert_allclose(found.uncertain[:, 0], size, rtol=1e-6)
+    largest = [1e-6 * np.exp(-0.25), max(np.exp(-t) * np.hypot(3e-6 * t, 2e-6)
+                                         for t in mesh.edges[1:])]
+    own = np.abs(found.trajectory.values).max(axis=(0, 1))
+    np.testing.assert_allclose((found.errors * own)[:, 0], largest, rtol=1e-5)

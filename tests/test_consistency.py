@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import one_state
+from processes import refused
 
 from benchmarks.honesty import made
 from gpebo_cli import load_plant
@@ -17,10 +18,21 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.scaling import balance
-from gpebo_cli.reduction.stages import in_stages
-from gpebo_cli.reduction.strangeness_free import forcing, strangeness_free_form
-from gpebo_cli.reduction.structure import _probe_times, analyse
+from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
+from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
+from gpebo_cli.reduction.strangeness_free import (
+    _by_singular_vectors,
+    _refuse_undetermined,
+    forcing,
+    strangeness_free_form,
+)
+from gpebo_cli.reduction.structure import (
+    _probe_times,
+    _refuse_crossing,
+    _why_not,
+    analyse,
+    without_equations,
+)
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start
 from gpebo_cli.simulation.simulate import simulate
@@ -57,6 +69,13 @@ def test_a_consistent_state_is_returned_as_it_is(seed, nu, extra, scale):
     x0 = found.exact(ZERO)[0]
     same = consistent_state(form, x0, structure.scaling.weights)
     assert same.tolist() == x0.tolist()
+
+
+def test_a_start_that_numbers_do_not_tell_is_none():
+    found, structure, form = case(3, 2, 2)
+    x0 = found.system.initial_state + np.arange(1.0, found.system.n + 1.0)
+    assert np.isfinite(consistent_state(form, x0, structure.scaling.weights)).all()
+    assert np.isnan(consistent_state(form, x0, np.inf * structure.scaling.weights)).all()
 
 
 @settings(deadline=None, max_examples=40)
@@ -160,6 +179,17 @@ def test_scalings_undo_units(seed, n, of_E):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
 
 
+@pytest.mark.parametrize("common", np.geomspace(1.0, 10.0, 7))
+def test_equations_within_a_decade_count_as_they_were_written(common):
+    """And one that is a thousand times as large counts a thousandth, whatever all are in."""
+    rows = common * np.array([1.0, 1.5, 0.6, 1e3])
+    E, A = rows[:, None] * np.eye(4), rows[:, None] * (np.ones((4, 4)) + np.eye(4))
+    none, empty = np.zeros((1, 1, 4, 0)), np.zeros((1, 1, 0))
+    c = Coefficients(E[None, None], A[None, None], none, none, none, empty, empty,
+                     np.zeros((1, 1, 4)), none, none)
+    np.testing.assert_allclose(balance(c).weights, [1.0, 1.0, 1.0, 1e-3])
+
+
 def test_no_piece_between_jumps_goes_unprobed():
     """A rank may be lost in one of many short pieces alone."""
     plant = plant_from_mapping(one_state(A=[["sign(sin(150*t)) - 2"]]))
@@ -190,3 +220,184 @@ def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
     })
     x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
     np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)
+
+
+@settings(max_examples=8)
+@given(SEEDS, st.integers(3, 11))
+def test_scales_by_entries_are_those_of_matrices_and_rounding_changes_neither(seed, n):
+    """An entry of 1e-25 beside entries of one is not there."""
+    rng = np.random.default_rng(seed)
+    both = rng.normal(size=(2, n, n)) * (rng.random((2, n, n)) < 0.4)
+    both[1, range(n), range(n)] = both[1, :, 0] = both[1, -1] = 1.0  # all of them hang together
+    found = []
+    for nothing in (0.0, 1e-25):
+        both[:, 0, 1] = 0.0, nothing
+        (E, A), none, empty = both[:, None, None], np.zeros((1, 1, n, 0)), np.zeros((1, 1, 0))
+        found.append(balance(Coefficients(
+            E, A, none, none, none, empty, empty, np.zeros((1, 1, n)), none, none
+        )))
+        places = tuple(np.argwhere(both).T)
+        found.append(balance_entries(np.abs(both[places]), places, n))
+    there = np.abs(both) > 1e-20
+    scaled = [(both * s.rows[:, None] * s.columns / np.array([[[s.time]], [[1.0]]]))[there]
+              for s in found]
+    for one in scaled[1:]:  # factors are rounded to powers of two
+        assert (np.abs(np.log2(one / scaled[0])) <= 1.01).all()
+
+
+@settings(max_examples=20)
+@given(SEEDS, st.integers(2, 30))
+def test_scales_of_full_matrices_make_largest_entries_one(seed, n):
+    """Of rows, of columns, and of E/τ beside A, in any units."""
+    rng = np.random.default_rng(seed)
+    E, A = rng.normal(size=(2, n, n))
+    E[n // 2 :] = 0.0
+    x, of_rows, T = 10.0 ** rng.integers(-6, 7, n), 10.0 ** rng.integers(-6, 7, n), 1e3
+    E, A = T * of_rows[:, None] * E / x, of_rows[:, None] * A / x
+    rows, columns, time = scales_of(E, A)
+    e, a = (np.abs(rows[:, None] * matrix * columns) for matrix in (E / time, A))
+    for axis in (0, 1):
+        np.testing.assert_allclose(np.log2(np.maximum(e, a).max(axis=axis)), 0.0, atol=1.5)
+    beside = np.median((e.max(axis=1) / a.max(axis=1))[: n // 2])
+    assert abs(np.log2(beside)) < 1.5
+
+
+@pytest.mark.parametrize(("usual", "rounding"), [(1.0, False), (1e-12, True)])
+def test_why_a_rank_is_unclear_at_one_time(usual, rounding):
+    """The constraint is what 1e-12 of large terms leaves: just there, or it is so at all times."""
+    turned = np.array([[0.8, -0.6], [0.6, 0.8]])
+    row = np.tile([usual, usual], (5, 1))
+    row[3] = 1e-12, 1e-15
+    A = turned @ np.stack([np.ones((5, 2)), row], axis=1)
+    model = np.zeros((2, 2, 5, 2, 2))
+    model[0, 0], model[1, 0] = turned @ np.diag([1.0, 0.0]), A
+    with pytest.raises(UnclearError) as unclear:
+        in_stages(*model, np.zeros((2, 5, 2, 0)), 1e-10, 1)
+    assert (unclear.value.place, unclear.value.rounding, unclear.value.sudden) == (
+        3, rounding, True)
+
+
+@pytest.mark.parametrize(("singular", "value"), [((2.0, 2e-3, 0.0), "1.0e-03"),
+                                                 ((2.0, 2e-12, 0.0), "1.0e-12")])
+def test_a_rank_that_is_another_than_at_the_reference_is_named_with_its_time(singular, value):
+    """Of three, two singular values are zero at first: one of them is not, or a third one is."""
+    structure = replace(without_equations(), a=2 if value == "1.0e-03" else 1, rank_tol=1e-10)
+    M = np.zeros((4, 3, 3))
+    M[:, 0, 0] = 1.0
+    M[:, 1, 1] = 1.0 * (structure.a == 1)
+    M[2] = np.diag(singular)
+    system, N = made(np.random.default_rng(0), 3, 1).system, np.broadcast_to(np.eye(3), M.shape)
+    t = np.array([0.5, 1.0, 1.5, 2.0])
+    said = rf"derivative array changes near t = 1\.5 \(singular value {value}\)"
+    with pytest.raises(ModelError, match=said):
+        _by_singular_vectors(system, structure, N, M, N, t)
+    some = t != 1.5
+    Z1, Z2 = _by_singular_vectors(system, structure, N[some], M[some], N[some], t[some])
+    assert Z1.shape == (3, 3, 3 - structure.a)
+    assert np.abs(np.swapaxes(Z2, 1, 2) @ M[some]).max() < 1e-15
+
+
+@settings(max_examples=10, deadline=None)
+@given(SEEDS)
+def test_terms_of_equations_are_the_sizes_of_what_they_are_the_sum_of(seed):
+    """With large ones of either sign that cancel, at the last of each three times."""
+    rng = np.random.default_rng(seed)
+    A, B, F = rng.normal(size=(3, 3)), 1e6 * rng.normal(size=(3, 2)), rng.normal(size=(3, 1))
+    phi, t = rng.normal(size=3), np.linspace(0.5, 2.0, 6)
+    system = plant_from_mapping({
+        "name": "terms", "states": ["a", "b", "c"], "inputs": {"u": "1 + t", "v": "cos(t)"},
+        "E": np.diag([1, 2, 4]).tolist(), "A": [[f"({x})*t" for x in row] for row in A.tolist()],
+        "B": B.tolist(), "F": F.tolist(), "unknowns": {"w": -3.0}, "phi": phi.tolist(),
+        "initial_state": [0, 0, 0],
+    })
+    structure = analyse(system, 0.0, 2.0, max_mu=2, rank_tol=1e-10)
+    form = strangeness_free_form(system, structure, t, t, points=3)
+    t = t[2::3, None, None]
+    signals = np.abs(np.concatenate([1.0 + t, np.cos(t)], axis=1))
+    known = np.abs(B) @ signals + 3.0 * np.abs(F) + np.abs(phi)[:, None]
+    rows = np.abs(np.broadcast_to(form.E1, (6, 3, 3))[2::3]) / [1, 2, 4]
+    sizes = np.concatenate([np.abs(A) * t, known], axis=2)
+    np.testing.assert_allclose(form.terms, rows @ sizes, rtol=1e-12)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("fast", [3.0, 1e5])
+def test_rates_of_the_differential_part_are_those_of_the_plant(fast, varying, unit):
+    """Index 3 in turned rows and states, by the derivative array or one stage after the other."""
+    rng = np.random.default_rng(1)
+    P, Q = (np.linalg.qr(rng.normal(size=(5, 5)))[0] for _ in "PQ")
+    E, A = np.diag([1.0, 1, 0, 0, 0]), np.diag([-fast, 0.7, 1, 1, 1])
+    E[2, 3] = E[3, 4] = 1.0
+    moves = f"*(1 + t/{100.0 * unit!r})" if varying else ""
+    structure = analyse(plant_from_mapping({
+        "name": "turned", "states": list("abcmn"), "E": (unit * P @ E @ Q).tolist(),
+        "A": [[f"{x!r}{moves}" for x in row] for row in (P @ A @ Q).tolist()],
+        "initial_state": [0] * 5,
+    }), 0.0, unit, max_mu=4, rank_tol=1e-10)
+    assert (structure.mu, structure.a, structure.d) == (2, 3, 2)
+    assert (len(structure.stages) > 0) == (fast > 100.0)
+    assert structure.growth * unit == pytest.approx(0.7, rel=0.011)
+    assert 1.0 < structure.rate * unit / fast < 1.2
+    assert structure.smallest_singular_value > 0.01
+    assert structure.steady or varying
+
+
+def test_singular_values_of_a_stage_are_those_of_its_matrices():
+    """Of E, of orthonormal constraints, of E on their kernel; and a constraint's size."""
+    E, A = np.diag([2.0, 0.5, 0.0]), np.array([[1.0, 2, 3], [4, 5, 6], [0.3, 0, 0.4]])
+    found = in_stages(E[None, None], A[None, None], np.zeros((1, 1, 3, 0)), 1e-10, 1)
+    kernel = np.array([[0.8, 0.0], [0.0, 1.0], [-0.6, 0.0]])
+    least = np.linalg.svd(E @ kernel, compute_uv=False)[-1] / np.linalg.norm(E)
+    np.testing.assert_allclose(found.smallest, [[0.25, 1.0, least, 0.5]], rtol=1e-12)
+    np.testing.assert_allclose(np.abs(found.A2), [[[0.6, 0.0, 0.8]]], atol=1e-15)
+
+
+def test_how_fast_coefficients_move_is_the_largest_slope_beside_its_size():
+    model = np.zeros((3, 2, 4, 2, 2))
+    model[:, 0], model[0, 1], model[1, 1] = 2.0, 6.0, -4.0
+    assert _Rounding(*model, 1).rate == 3.0
+    assert _Rounding(*model[:, :1], 1).rate == 0.0  # no slopes are known
+
+
+def test_what_says_against_an_index_is_named_with_its_time():
+    """The singular value, and of which: dependent constraints first, then states without any."""
+    t, smallest = np.array([1.0, 2.5, 4.0]), np.ones((3, 3))
+    smallest[0, 0] = 0.0  # of the derivative array itself: its rank says what there is
+    assert _why_not(t, smallest, 1e-10) == ""
+    smallest[2, 2] = 1e-12
+    assert _why_not(t, smallest, 1e-10) == (
+        "some states are in no equation's derivative and in no constraint at t = 4 (singular "
+        "value 1.0e-12)")
+    smallest[1, 1] = 1e-11
+    said = "constraints are linearly dependent at t = 2.5 (singular value 1.0e-11)"
+    assert _why_not(t, smallest, 1e-10) == said
+
+
+@pytest.mark.parametrize(("max_mu", "said"), [
+    (0, "0 differentiations constraints are linearly dependent at t = 0.001"),
+    (2, "2 differentiations 4 constraints appear for 3 states (t = 0.001)"),
+])
+def test_an_equation_that_is_there_twice_is_refused_with_what_it_leads_to(max_mu, said):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "c"], "E": np.diag([1, 0, 0]).tolist(),
+        "A": [[-1, 1, 1], [0, 1, 1], [0, 1, 1]], "initial_state": [1, 1, 1],
+    })
+    with refused(said, by=ModelError):
+        analyse(plant, 0.0, 1.0, max_mu=max_mu, rank_tol=1e-10)
+
+
+def test_a_determinant_that_changes_its_sign_between_two_times_is_refused_where_it_is_zero():
+    plant = plant_from_mapping(one_state(E=[["(t - 0.3712)*(1 + t)"]]))
+    t = np.array([0.1, 0.2, 0.7, 0.9])
+    E = plant.coefficients.taylor(t, 0).E[0]
+    with refused("differential part changes at t = 0.3712 (det E changes its sign)", by=ModelError):
+        _refuse_crossing(plant, t, E)
+    _refuse_crossing(plant, t[2:], E[2:])
+
+
+def test_equations_that_leave_a_state_open_are_refused_with_the_first_time():
+    plant, t = plant_from_mapping(one_state()), np.array([0.5, 1.25, 2.0])
+    said = "plant p: the equations do not determine the state near t = 1.25"
+    with refused(said, by=ModelError):
+        _refuse_undetermined(plant, np.array([False, True, True]), t)

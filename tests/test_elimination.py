@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from gpebo_cli.numerics.elimination import StiffError, by_elimination
+from gpebo_cli.numerics import series
+from gpebo_cli.numerics.elimination import StiffError, _residual, by_elimination
 from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.problem import LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.series import sparse
 
@@ -65,9 +67,71 @@ def test_pivots_that_harm_are_seen():
     _, left = solved(sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
     assert left.max() > 1e-13
 
+    def equation(mesh):
+        return sparse(A), np.zeros((1, D, 1)), ()
+
+    problem, mesh = LinearProblem(None, np.ones((D, 1))), Mesh(np.array([0.0, H[0]]), RULE)
+    limits = {"units": np.ones(D), "tol": 1e-9, "max_elements": 99, "stiff": True}
+    assert series.solve(problem, equation, mesh, **limits | {"tol": 1e-13}) is None
+    A[0, 0, 0] *= 1.1
+    assert series.solve(problem, equation, mesh, **limits).error_estimate < 1e-6
+
 
 def test_what_elimination_fills_is_refused():
     A = np.random.default_rng(3).normal(size=(1, 60, 60))
     A[0][np.random.default_rng(4).uniform(size=(60, 60)) < 0.75] = 0.0
     with pytest.raises(StiffError):
         solved(sparse(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_what_is_left_of_equations_is_relative_to_their_terms(varying):
+    """Of values that solve nothing, against dense matrices."""
+    rng = np.random.default_rng(7)
+    h, start = H[1:3], np.zeros((D, 2))
+    A, matrix = system(rng, len(h), varying)
+    f = rng.normal(size=(len(h) * (S + 1), D, 1))
+    values = rng.normal(size=(len(h), S + 1, D, 2))
+    derivative = np.linalg.inv(RULE.integration)
+    found = _residual(derivative, h, matrix.rows, matrix.columns, matrix.entries, f, values)
+    for k, step in enumerate(h):
+        points = slice(k * (S + 1), (k + 1) * (S + 1)) if varying else slice(None)
+        here, known = values[k], np.zeros((S + 1, D, 2))
+        known[:, :, :1] = f[k * (S + 1) : (k + 1) * (S + 1)]
+        slopes = np.tensordot(derivative, here[1:] - start - here[0], axes=1) / step
+        left = np.abs(slopes - (A[points] @ here + known)[1:]).max(axis=0)
+        largest = np.abs(here).max(axis=0)
+        size = np.abs(derivative).sum(axis=1).max() / step * largest + np.abs(known).max(axis=0)
+        size += np.abs(A[points]).max(axis=0) @ largest
+        assert found[k] == pytest.approx((left / size).max(), rel=1e-12)
+
+
+@pytest.mark.parametrize("times", [1, 4])
+def test_matrices_by_their_entries_are_what_full_ones_are(times):
+    """Products by few entries and by all of them, bounds of rates in any units, largest entries."""
+    rng = np.random.default_rng(times)
+    A = rng.normal(size=(times, 9, 9)) * (rng.random((9, 9)) < 0.2)
+    A[:, 0], A[:, :, 0], A[:, range(1, 9), range(1, 9)] = 0.0, 0.0, -2.0
+    matrix, units = sparse(A), 10.0 ** rng.integers(-3, 4, 9)
+    np.testing.assert_array_equal(matrix.full(), A)
+    for columns in (1, 30):
+        x = rng.normal(size=(4, 9, columns))
+        np.testing.assert_allclose(matrix.product(matrix.entries, x), A @ x, atol=1e-13)
+    sizes = matrix.sizes(2 if times == 4 else 1)
+    largest = np.abs(A).reshape(len(sizes), -1, 9, 9).max(axis=1)
+    np.testing.assert_array_equal(matrix._replace(entries=sizes).full(), largest)
+    turned = sparse(A * units / units[:, None])
+    rates = np.linalg.eigvals(A)
+    for one, own in ((matrix, np.ones(9)), (turned, 1.0 / units)):
+        norms, plain = one.norms(one.sizes(times), own), np.abs(A)
+        assert (np.abs(rates).max(axis=1) <= norms * (1.0 + 1e-12)).all()
+        plain = np.minimum(plain.sum(axis=1).max(axis=1), plain.sum(axis=2).max(axis=1))
+        np.testing.assert_allclose(norms, plain, rtol=1e-12)
+        assert one.growth(own, 0.0) == pytest.approx(max(rates.real.max(), 0.0), rel=1e-6)
+        assert one.growth(own, 1e9) >= rates.real.max()
+        assert one.growth(own, 1e9) == pytest.approx(matrix.growth(np.ones(9), 1e9), rel=1e-12)
+
+
+def test_matrices_of_which_most_entries_are_there_are_full():
+    assert sparse(np.ones((2, 3, 3))) is None
+    assert len(sparse(np.eye(4)[None]).columns) == 4

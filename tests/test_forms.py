@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from plants import BOOST, LORENZ, shipped
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
+from units import drawn, in_units
 
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
@@ -304,6 +306,59 @@ def test_observers_of_the_current_state_take_the_same_form(observer):
     )
     assert np.abs(result.errors["leak"][0, -1]) < 1e-6
     assert np.abs(result.errors["flow"][0, -1]) < 1e-6
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize(("plant", "derivatives"), [
+    (CAPACITORS, [(1, 3)]), (CRANE, [(1, 1), (2, 1)]), (LC_LOOP, [(1, 0)]), (PENDULUM, []),
+], ids=lambda p: p["name"] if isinstance(p, dict) else "")
+def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
+    plant, derivatives, unit
+):
+    start = dict(zip(plant["states"], plant["initial_state"], strict=True))
+    by = drawn(np.random.default_rng(2), plant_from_mapping(plant), decades=True)
+    made = in_units({**plant, "initial_state": start}, by._replace(time=unit))
+    system, t = plant_from_mapping(made), unit * np.linspace(0.0, 5.0, 17)
+    inputs = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
+    given = EquationForm.given(system, inputs, t)
+    found = strangeness_free(given, t, t, None, max_mu=4, rank_tol=1e-10)
+    assert list(found.derivatives) == derivatives
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differentiated(known):
+    """Tanks whose leak an input sets: the derivative of the other one is in a hidden constraint."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "f"], "inputs": {"u": "2 + sin(t)", "v": "cos(t)"},
+        "outputs": ["y"], "E": np.diag([1, 1, 0]).tolist(),
+        "A": [["-u", 0, 1], [0, -1, 1], [1, -1, 0]], "B": [[0, 1], [0, 0], [0, 0]],
+        "C": [[1, 0, 0]], "initial_state": [1, 1, 0],
+    })
+    t = np.linspace(0.0, 2.0, 17)
+    signals = np.stack([2.0 + np.sin(t), np.cos(t), 0.0 * t], axis=1)
+    inputs = InputDerivatives.of_plant(system, np.array([known, True]))
+    given = EquationForm.given(system, inputs, t, signals=signals)
+    refused = pytest.raises(ConfigError, match="derivatives of the input u, the equations contain")
+    with nullcontext() if known else refused:
+        strangeness_free(given, t, t, signals, max_mu=3, rank_tol=1e-10)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_derivatives_of_inputs_go_along_where_they_are_known(known):
+    """Those of outputs never do; of order zero there are values alone."""
+    system, t = plant_from_mapping(BOOST), np.linspace(0.1, 1.0, 5)
+    inputs = InputDerivatives.of_plant(system, np.array([True])) if known else None
+    signals = np.stack([0.5 + 0.1 * np.sin(3 * t), 18.0 + t], axis=1)
+    form = EquationForm.given(system, inputs, t, signals=signals)
+    for order in (0, 2):
+        along = form.along(t, t, signals, order)
+        assert along.shape == (order + 1, 5, 2)
+        np.testing.assert_array_equal(along[0], signals)
+        assert not along[1:, :, 1].any()
+        slopes = np.stack([0.3 * np.cos(3 * t), -0.45 * np.sin(3 * t)])[:order] * known
+        np.testing.assert_allclose(along[1:, :, 0], slopes, atol=1e-14)
+    with pytest.raises(ValueError, match="follow signals, and none are given"):
+        form.along(t, t, None, 0)
 
 
 def test_a_noisy_input_in_a_hidden_constraint_is_named():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,10 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.experiment.verdict import simulation_note, simulation_verdict
 from gpebo_cli.model.functions import system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.settings import SolverSettings, TimeSettings
+from gpebo_cli.simulation.known import _overlooked
 from gpebo_cli.simulation.simulate import simulate
 
 GROWS = "grows|is not finite|may grow"
@@ -148,6 +152,21 @@ def test_values_of_functions_that_are_rounding_ask_for_no_elements(constant):
     assert abs(found.signals.states(np.array([10.0]))[0, 1] - truth) < 1e-8 * truth
 
 
+@pytest.mark.parametrize(("beside", "seen"), [(0.0, True), (1e-5, True), (1.0, False)])
+def test_a_pulse_between_nodes_is_looked_for_if_it_is_no_rounding_beside_others(beside, seen):
+    """Of 1e-14: in its equations other terms have a size. It is in the third of four elements."""
+    plant = system_from_functions(
+        "pulse", np.eye(1), -np.eye(1), B=np.eye(1), C=np.eye(1), initial_state=[1],
+        u=lambda t: 1e-14 * np.exp(-(((t - 0.5123) / 2e-3) ** 2))[:, None],
+    )
+    mesh = Mesh(np.linspace(0.0, 1.0, 5), radau_rule(8))
+    c = plant.coefficients.taylor(mesh.points.ravel(), 0, mesh.inside.ravel())
+    found = _overlooked(
+        plant, c, lambda t: plant.coefficients.taylor(t, 0), mesh, 1e-9, np.array([beside])
+    )
+    assert found.tolist() == [False, False, seen, False]
+
+
 def silenced(family, seed):
     """A case of a family of which half of the states are zero, up to rounding."""
     rng = np.random.default_rng([7, seed])
@@ -237,9 +256,12 @@ def test_a_state_that_vanishes_and_returns_is_not_lost():
 
 def test_growth_is_lost_when_its_rounding_is_as_large_as_the_state():
     """x' = (x − sin t)/2 + cos t is sin t beside 1e-17 e^{t/2}, and not what that has become."""
-    plant = scalar("0.5", 0.0, "cos(t) - 0.5*sin(t)")
-    with pytest.raises(SolverError, match=r"larger than a state from t = [567]\d\."):
-        simulate(plant, TimeSettings(horizon=200.0), SolverSettings())
+    plant, told = scalar("0.5", 0.0, "cos(t) - 0.5*sin(t)"), []
+    for horizon in (200.0, 2000.0):  # up to 1e26, and beyond all numbers
+        with pytest.raises(SolverError, match=r"larger than a state from t = [567]\d\.") as lost:
+            simulate(plant, TimeSettings(horizon=horizon), SolverSettings())
+        told.append(float(re.search(r"from t = (\S+) on", str(lost.value))[1]))
+    assert told[1] == pytest.approx(told[0], abs=3.0)
 
 
 @pytest.mark.parametrize(

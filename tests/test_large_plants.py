@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import tracemalloc
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -24,6 +24,8 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.reduction import scaling
+from gpebo_cli.reduction.constant import constant_form
+from gpebo_cli.reduction.explicit import UndecidedError
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -76,6 +78,14 @@ def ungrounded(cells):
     return E, A, B, C
 
 
+def tied(cells):
+    """Index 2: two capacitors side by side, of which the second is twice as large."""
+    E, A, B, C = ladder(cells)
+    E[1, 1], A[-1], B[:], A[0, -1], A[1, -1] = 2.0, 0.0, 0.0, 1.0, -1.0
+    A[-1, 0], A[-1, 1], B[cells, 0] = 1.0, -1.0, 1.0
+    return E, A, B, C
+
+
 def chain(cells):
     """Index 3: masses and springs, of which the last has its position prescribed."""
     n = 2 * cells + 1
@@ -90,10 +100,23 @@ def chain(cells):
     return E, A, B, C
 
 
-PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, chain]
+def grid(cells):
+    """Heat on cells × 3 nodes: loops, which elimination fills; conductances over four decades."""
+    n = 3 * cells
+    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
+    for i in range(n):
+        for j in {i + 1, i + 3} & set(range(n)):
+            g = 10.0 ** (4 * (i * 7 % n) / n)
+            A[np.ix_([i, j], [i, j])] += g * np.array([[-1.0, 1.0], [1.0, -1.0]])
+    A[0, 0] -= 1.0
+    B[0, 0] = C[0, 0] = C[1, -1] = 1.0
+    return E, A, B, C
 
 
-def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1):
+PLANTS = [ladder, source_on_a_node, current_source, floating, ungrounded, tied, chain]
+
+
+def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, inputs=1, **more):
     E, A, B, C = build(cells)
     n = len(E)
 
@@ -107,7 +130,7 @@ def plant(build, *, varying=False, cells=CELLS, u="sin(t)", rate=1.0, swing=1, i
         "outputs": ["y1", "y2"], "E": text(E, "1 + 0.3*cos(t + {})"),
         "A": text(rate * A, f"1 + 0.2*sin({swing}*t + {{}})"),
         "B": np.repeat(B / inputs, inputs, axis=1).tolist(), "C": C.tolist(),
-        "initial_state": [1.0, 0.5, *[0.1] * (n - 2)],
+        "initial_state": [1.0, 0.5, *[0.1] * (n - 2)], **more,
     })
 
 
@@ -121,7 +144,12 @@ def both(system, tol=1e-9):
 @pytest.mark.parametrize("varying", [False, True])
 @pytest.mark.parametrize("build", PLANTS)
 def test_structure_start_and_solution_are_those_of_the_derivative_array(build, varying):
-    found, dense = both(plant(build, varying=varying))
+    known = np.arange(len(build(CELLS)[0])) == CELLS + 1  # further terms, in one equation
+    found, dense = both(plant(
+        build, varying=varying, unknowns={"w": 0.3, "v": -2.0}, D=[[0.5], ["cos(t)"]],
+        F=[["1 + sin(t)", 0.2] if here else [0, 0] for here in known], H=[[0, 2], ["t", 0]],
+        phi=["cos(2*t)" if here else 0 for here in known],
+    ))
     one, other = found.structure, dense.structure
     assert (one.index, one.mu, one.a, one.d) == (other.index, other.mu, other.a, other.d)
     np.testing.assert_allclose(found.initial_state, dense.initial_state, atol=1e-13)
@@ -132,6 +160,39 @@ def test_structure_start_and_solution_are_those_of_the_derivative_array(build, v
     assert (wrong < 10.0 * found.state_errors + 1e-12).all()
     assert found.state_errors.max() < 1e-8
     np.testing.assert_allclose(found.signals.outputs(t), dense.signals.outputs(t), atol=1e-8)
+
+
+@pytest.mark.parametrize("build", PLANTS)
+def test_the_structure_alone_is_that_of_the_derivative_array(build):
+    """By elimination; of few states by the array itself."""
+    system, settings = plant(build, varying=True), (TIME, SolverSettings())
+    one, other = large.structure_of(system, *settings), large.dense_structure(system, *settings)
+    assert (one.mu, one.a, one.d, one.time_invariant) == (other.mu, other.a, other.d, False)
+    assert one.reference.rank == 0 < other.reference.rank
+    assert large.structure_of(plant(build, cells=3), *settings).reference.rank > 0
+
+
+def star(cells):
+    """One algebraic state that is the sum of all others, and drives them."""
+    E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)
+    A[:, -1], A[-1, :-1], E[-1, -1], A[-1, -1] = 1.0, 1.0, 0.0, -2.0
+    return E, A, np.eye(cells + 1, 1), C
+
+
+@pytest.mark.parametrize(("system", "most"), [
+    (lambda: plant(source_on_a_node, u="sin(t) + step(t - 3)"), 999),  # a jump has an impulse
+    (lambda: plant(ladder), 7),  # elements
+    (lambda: plant(star, varying=True, cells=60), 999),  # elimination fills what is sparse
+])
+def test_what_series_are_not_made_for_is_left_to_the_derivative_array(system, most):
+    assert large.large_simulation(system(), TIME, SolverSettings(max_elements=most)) is None
+
+
+def test_indices_of_full_matrices_have_the_limit_of_differentiations():
+    E, A, *_ = chain(10)
+    assert constant_form(E, A, 2).mu == 2
+    with pytest.raises(UndecidedError):
+        constant_form(E, A, 1)
 
 
 def test_inputs_may_be_the_same_function():
@@ -166,44 +227,64 @@ def test_errors_are_not_larger_than_they_are_said_to_be(build):
         assert (off <= 10.0 * found.state_errors * np.abs(true).max(axis=0)).all()
 
 
-def test_a_change_of_units_changes_nothing():
-    system, found = plant(ladder, varying=True), []
+def test_a_state_that_an_input_gives_is_as_wrong_as_polynomials_leave_it():
+    """x0 = u: nothing is integrated for it."""
+    system = plant(source_on_a_node, u="exp(-((t - 4)/0.3)**2)")
+    found = large.large_simulation(system, TIME, SolverSettings(tol=1e-4, stages=5))
+    t = np.linspace(0.0, TIME.horizon, 2001)
+    wrong = np.abs(found.signals.states(t)[:, 0] - np.exp(-(((t - 4) / 0.3) ** 2))).max()
+    assert 1e-7 < wrong < found.state_errors[0] < 1e-3
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize(("build", "rate"), [
+    *((build, 1.0) for build in (ladder, current_source, floating, tied, chain, grid)),
+    (ladder, 1e5),
+])
+def test_a_change_of_units_and_signs_changes_nothing(build, rate, varying):
+    """States, equations, time and the input: structure, start, solution, its errors, elements."""
+    E, A, B, C = build(CELLS)
+    n, rng, found = len(E), np.random.default_rng(1), []
+    start = np.array([1.0, 0.5, *[0.1] * (n - 2)])
     for power in (0.0, 1.0):
-        units = 10.0 ** (power * np.linspace(-9, 6, system.n))
-        E, A, B, C = ladder(CELLS)
-        found.append(units * large.large_simulation(load_plant({
-            "name": "units", "states": list(system.states), "inputs": {"u": "sin(t)"},
-            "outputs": ["y1", "y2"], "E": (E * units).tolist(), "B": B.tolist(),
-            "A": [[f"{v!r}*(1 + 0.1*sin(t))" for v in row] for row in (A * units).tolist()],
-            "C": (C * units).tolist(), "initial_state": (system.initial_state / units).tolist(),
-        }), TIME, SolverSettings()).signals.states.final)
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-7)
+        x, rows = (10.0 ** (power * rng.integers(-6, 7, n)) * rng.choice([-1.0, 1.0], n) ** power
+                   for _ in range(2))
+        T, d = 10.0 ** (power * 3), -10.0 ** (power * 2) if power else 1.0
+
+        def text(matrix, factor, x=x, rows=rows, T=T):
+            scaled = (rows[:, None] * matrix / x).tolist()
+            return [[f"{v!r}*({factor.format(f't/{T!r}')})" if v and varying else v for v in row]
+                    for row in scaled]
+
+        one = large.large_simulation(load_plant({
+            "name": "units", "states": [f"x{k}" for k in range(n)], "outputs": ["y1", "y2"],
+            "inputs": {"u": f"{d!r}*sin(t/{T!r})"}, "E": text(T * E, "1 + 0.3*cos({})"),
+            "A": text(rate * A, "1 + 0.2*sin({})"), "B": (rows[:, None] * B / d).tolist(),
+            "C": (C / x).tolist(), "initial_state": (start * x).tolist(),
+        }), TimeSettings(horizon=8.0 * T), SolverSettings(tol=1e-9))
+        found.append((one, one.initial_state / x, one.signals.states.values / x))
+    (one, start, x), (other, again, y) = found
+    size, parts = np.abs(x).max(axis=(0, 1)), ("mu", "a", "d")
+    assert [getattr(one.structure, p) for p in parts] == [
+        getattr(other.structure, p) for p in parts]
+    assert (np.abs(again - start) < 1e-14 * size).all()
+    assert (np.abs(y[-1, -1] - x[-1, -1]) < 1e-10 * size).all()
+    assert np.abs(np.log(other.state_errors / one.state_errors)).max() < np.log(8.0)
+    assert len(x) / 3 < len(y) < 3 * len(x)
 
 
+@pytest.mark.parametrize(("matrix", "k"), [("E", 2), ("A", -1)])
 @pytest.mark.parametrize("factor", ["sin(t - 4)", "(0.01 + (t - 4)**2)"])
-def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(factor):
+def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(matrix, k, factor):
     E, A, B, C = ladder(CELLS)
-    rows = A.tolist()
-    rows[-1][-1] = factor
+    rows = {"E": E.tolist(), "A": A.tolist()}
+    rows[matrix][k][k] = factor
     system = load_plant({
         "name": "near", "states": [f"x{k}" for k in range(len(E))], "inputs": {"u": "sin(t)"},
-        "outputs": ["y1", "y2"], "E": E.tolist(), "A": rows, "B": B.tolist(), "C": C.tolist(),
+        "outputs": ["y1", "y2"], **rows, "B": B.tolist(), "C": C.tolist(),
         "initial_state": [0.0] * len(E),
     })
     assert large.large_simulation(system, TIME, SolverSettings()) is None
-
-
-def grid(cells):
-    """Heat on cells × 3 nodes: loops, which elimination fills; conductances over four decades."""
-    n = 3 * cells
-    E, A, B, C = np.eye(n), np.zeros((n, n)), np.zeros((n, 1)), np.zeros((2, n))
-    for i in range(n):
-        for j in {i + 1, i + 3} & set(range(n)):
-            g = 10.0 ** (4 * (i * 7 % n) / n)
-            A[np.ix_([i, j], [i, j])] += g * np.array([[-1.0, 1.0], [1.0, -1.0]])
-    A[0, 0] -= 1.0
-    B[0, 0] = C[0, 0] = C[1, -1] = 1.0
-    return E, A, B, C
 
 
 @pytest.mark.parametrize("varying", [False, True])
@@ -219,6 +300,8 @@ def test_a_stiff_sparse_plant_is_as_wrong_as_it_says(build, rate, varying):
         wrong = np.abs(one.signals.states(t) - true).max(axis=0) / np.abs(true).max(axis=0)
         assert (wrong <= 3.0 * (one.state_errors + exact.state_errors)).all()
         assert wrong.max() < 1e-8
+    ratio = found.state_errors / dense.state_errors
+    assert 0.1 < ratio.min() <= ratio.max() < 2e3
 
 
 @pytest.mark.parametrize(("n", "varying"), [(41, True), (41, False), (101, True)])
@@ -481,6 +564,56 @@ def test_a_full_stiff_plant_of_index_2_agrees_with_its_modes():
     assert (wrong <= found.state_errors).all()
 
 
+@pytest.mark.parametrize(("build", "varying"), [
+    *((build, varying) for build in PLANTS for varying in (False, True)), (None, False),
+])
+def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
+    """Both ways, at the first time alone, and by sizes; of a full plant, too."""
+    blocks = saddle(48, 11, np.random.default_rng(4))
+    system = plant(build, varying=varying) if build else full_plant(*matrices(blocks))
+    mesh, rng = Mesh(np.array([0.5, 1.0, 2.0]), radau_rule(4)), np.random.default_rng(0)
+    form = large._Plant(system, 7).eliminate(mesh)
+    z = rng.normal(size=(mesh.points.size, form.d, 1))
+    x, known = (form.states_from(y)[:, :, 0] for y in (z, 0.0 * z))
+    np.testing.assert_allclose(form.reduced(x[0]) - form.reduced(known[0]), z[0, :, 0], atol=1e-13)
+    first = form.at_first().states_from(z[:1])[0, :, 0]
+    np.testing.assert_allclose(first, x[0], atol=1e-14 * np.abs(x).max())
+    made_of, moved = form.sizes_from(np.abs(z).max(axis=0))[:, 0], np.abs(x - known).max(axis=0)
+    assert (moved <= made_of * (1.0 + 1e-12) + 1e-14).all()
+    assert (made_of <= 15.0 * np.maximum(moved, 0.1)).all()
+    assert form.loss == (1.0 if build else pytest.approx(1.0 / form.pivot))
+    if build is None:
+        assert (np.abs(known) <= form.known).all()
+        assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
+
+
+def test_a_full_plant_that_nothing_drives():
+    rng = np.random.default_rng(8)
+    E, A = np.linalg.qr(rng.normal(size=(51, 51)))[0], rng.normal(size=(51, 51)) / 9.0
+    system = load_plant({
+        "name": "free", "states": [f"x{k}" for k in range(51)], "E": E.tolist(), "A": A.tolist(),
+        "initial_state": [1.0] * 51,
+    })
+    found = large.large_simulation(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
+    end = expm(2.0 * E.T @ A) @ np.ones(51)
+    np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
+
+
+def test_a_full_plant_starts_from_the_nearest_state():
+    """‖M (v − v₀)‖ is least with J v = 0, and p follows from the derivative of that."""
+    rng = np.random.default_rng(4)
+    M, K, J, b = blocks = saddle(48, 11, rng)
+    x0, system = rng.normal(size=59), full_plant(*matrices(blocks), u="cos(3*t)")
+    grown = large._Plant(replace(system, initial_state=x0), 7)
+    grown.eliminate(Mesh(np.array([0.0, 1.0]), radau_rule(4)))
+    x, _ = large._start(grown)
+    free = null_space(J)
+    v = free @ np.linalg.lstsq(M @ free, M @ x0[:48], rcond=None)[0]
+    p = np.linalg.solve(J @ np.linalg.solve(M, J.T), J @ np.linalg.solve(M, K @ v - b))
+    np.testing.assert_allclose(x[:48], v, atol=1e-10)
+    np.testing.assert_allclose(x[48:], p, atol=1e-9 * np.abs(p).max())
+
+
 def test_a_full_plant_of_index_3_is_the_sparse_one_in_other_coordinates():
     rng = np.random.default_rng(5)
     E, A, B, C = chain(27)
@@ -613,18 +746,42 @@ def test_elements_that_are_cut_may_have_more_entries():
     (lambda t: 1.0 / (t + 0.05), lambda t: np.log(20.0 * t + 1.0)),  # powers do not fall
     (lambda t: 30.0 * np.cos(60.0 * t), lambda t: 0.5 * np.sin(60.0 * t)),  # nor converge at first
 ])
-def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm):
+@pytest.mark.parametrize("elements", [6, 20])
+def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm, elements):
+    """On elements that are short enough, or are cut first; five are too few."""
     def coefficients(t, inside):
         A = np.zeros((len(t), 9, 9))
         A[:, range(9), range(9)] = rate(t)[:, None]
         return LinearEquation(None, A, np.zeros((len(t), 9, 0)))
 
     problem = LinearProblem(coefficients, np.ones((9, 2)), name="rates")
-    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(14))
-    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
+    mesh = initial_mesh(0.0, 2.0, [], elements, radau_rule(14))
+    known = coefficients(mesh.points.ravel(), mesh.inside.ravel())
+    found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500, known=known)
+    assert series.solve_dense(problem, mesh, tol=1e-9, max_elements=5, known=known) is None
     t = np.linspace(0.0, 2.0, 31)
     error = np.abs(found.trajectory(t) / np.exp(logarithm(t))[:, None, None] - 1.0).max()
     assert error <= found.error_estimate * 10.0 <= 1e-6
+
+
+@pytest.mark.parametrize("swing", [0.0, 0.5])
+@pytest.mark.parametrize(("rate", "most"), [(3.0, 6.0), (-3.0, 1.15)])
+def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, most, swing):
+    """sin 20t, of which errors grow or are forgotten; what series leave out comes beside them."""
+    def coefficients(t, inside):
+        rates = rate * (1.0 + swing * np.cos(t if swing else np.zeros(1)))
+        f = 20.0 * np.cos(20.0 * t) - rates * np.sin(20.0 * t)
+        A, f = rates[:, None, None] * np.eye(9), f[:, None, None] * np.ones((9, 1))
+        return LinearEquation(None, A, f)
+
+    one = np.ones((9, 1))
+    problem = LinearProblem(coefficients, 0.0 * one, name="sines", units=one)
+    limits = {"tol": 1e-3, "max_elements": 500}
+    found = series.solve_dense(problem, initial_mesh(0.0, 2.0, [], 20, radau_rule(6)), **limits)
+    other = solve(problem, found.trajectory.mesh, **limits)
+    assert other.trajectory.mesh.size == found.trajectory.mesh.size
+    ratio = found.errors / other.errors
+    assert 1.0 < ratio.min() <= ratio.max() < most
 
 
 def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):

@@ -1063,5 +1063,7 @@ def test_pauses_are_said(hold, told, tmp_path):
 
 def test_errors_on_lines_have_the_steps_on_both_sides():
     """The corners of a hat over steps 1, 2 and 4 have the parts 1/4, 1/2 and 1/4."""
-    found = Rows(np.array([0.0, 1.0, 3.0, 7.0]), "linear").intensities(np.array([1.5]))
-    assert found == pytest.approx([0.25 * (1.0 + 2.0 * 2.0 + 4.0)])
+    rows, t = Rows(np.array([0.0, 1.0, 3.0, 7.0]), "linear"), np.array([0.5, 1.5, 5.0, 7.0])
+    # At both ends there is no further step: that beside it counts once more.
+    assert rows.intensities(t) == pytest.approx([1.25, 0.25 * (1.0 + 2.0 * 2.0 + 4.0), 3.5, 3.5])
+    assert rows._replace(hold="zoh").intensities(t) == pytest.approx([1.0, 2.0, 4.0, 4.0])

@@ -64,6 +64,8 @@ def test_noise_of_y_is_that_of_an_output():
     )
     assert quiet.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-3)
     assert 1e-4 < abs(noisy.estimates["a"][0, -1] - 2.0) < 0.2
+    told = quiet.details.simulation  # there are no equations
+    assert (told.index, told.strangeness_index, told.differential, told.algebraic) == (0, 0, 0, 0)
 
 
 def test_mistakes_name_the_file(tmp_path):

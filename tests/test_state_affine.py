@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -75,24 +77,49 @@ def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     assert 0.0 < effort.last_change <= SOLVER.tol
 
 
-@pytest.mark.parametrize("plant", [BOOST, one_state(phi=["-y - abs(y - 0.5)"])])
-def test_the_effort_is_what_was_solved(plant, monkeypatch):
-    """Each linear problem is an iterate, and costs by its digits; instants are met once more."""
+@pytest.mark.parametrize(("plant", "horizon", "several"), [
+    (BOOST, 3.0, False), (one_state(phi=["-y - abs(y - 0.5)"]), 3.0, False), (LORENZ, 1.5, True),
+])  # fmt: skip
+def test_the_effort_is_what_was_solved(plant, horizon, several, monkeypatch):
+    """Each linear problem is an iterate, and costs by its digits and window; instants once more.
+
+    Windows that led to nothing do not count, and at last the whole is solved.
+    """
     solved = []
 
     def counted(system, time, solver, solve):
         def kept(*arguments):
-            solved.append(arguments[2].tol)
+            _, window, settings, growth = arguments
+            solved.append((window.start, window.horizon, settings.tol, growth))
             return solve(*arguments)
 
         solved.clear()
         return follow(system, time, solver, kept)
 
     monkeypatch.setattr(simulation.simulate, "follow", counted)
-    effort = simulate(plant_from_mapping(plant), TimeSettings(horizon=3.0), SOLVER).effort
-    assert effort.windows == 1
-    assert effort.iterates == len(solved)
-    assert effort.linear_solves == pytest.approx(np.log(solved).sum() / np.log(SOLVER.tol))
+    found = simulate(plant_from_mapping(plant), TimeSettings(horizon=horizon), SOLVER)
+    windows = {start: length for start, length, _, growth in solved if growth < np.inf}
+    led = [(length, tol) for start, length, tol, growth in solved
+           if growth == np.inf or length == windows[start]]
+    assert found.effort.windows == len(windows)
+    assert (len(windows) > 1) == several
+    assert sum(windows.values()) == pytest.approx(horizon)
+    assert found.effort.iterates == len(led)
+    cost = sum(length * np.log(tol) for length, tol in led) / horizon / np.log(SOLVER.tol)
+    assert found.effort.linear_solves == pytest.approx(cost)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.5])
+def test_what_the_last_iterate_may_change_is_an_error_of_every_state(change, monkeypatch):
+    def changing(*arguments):
+        return replace(follow(*arguments), last_change=change)
+
+    monkeypatch.setattr(simulation.simulate, "follow", changing)
+    found = simulate(boost(), TimeSettings(horizon=0.5), SOLVER)
+    assert found.error_estimate == max(change, found.state_errors.max())
+    assert (found.state_errors == change).all() == (change > 0.0)
+    assert (found.state_errors > 0.0).all()
+    assert found.effort.last_change == change
 
 
 def test_a_run_says_what_newtons_method_cost():
@@ -214,6 +241,30 @@ def test_functions_of_outputs_from_python():
     assert not one.bounded
 
 
+def test_functions_of_outputs_from_python_may_have_hidden_constraints():
+    """The plant of index 2 above: derivatives along outputs are differences of functions."""
+    def A(t, u, y):
+        out = np.zeros((len(t), 3, 3), dtype=y.dtype)
+        out[:, 0, 0], out[:, 1, 0], out[:, 1, 1], out[:, [0, 2], [2, 0]] = -y[:, 0], y[:, 0], -1, 1
+        return out
+
+    def phi(t):
+        x1, x2, z = solution(t).T
+        return np.stack([np.cos(t) + x1 * x2 - z, -2 * np.sin(2 * t) - x1 * x2 + x2, -x1], axis=1)
+
+    def solution(t):
+        return np.stack([2 + np.sin(t), np.cos(2 * t), np.cos(3 * t)], axis=1)
+
+    system = system_from_functions(
+        "index 2", np.diag([1.0, 1, 0]), A, phi=phi, C=[[0, 1.0, 0]], initial_state=[2, 1, 0.3],
+        names=Names(outputs=["y"]),
+    )
+    t = np.linspace(0.0, 2.0, 21)
+    found = simulate(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-8))
+    np.testing.assert_allclose(found.signals.states(t), solution(t), atol=1e-9)
+    assert found.structure.index == 2
+
+
 def test_a_simulation_that_would_take_too_long_is_refused_on_the_way():
     with pytest.raises(SolverError, match="the simulation of 5000 s would take more computing"):
         simulate(lorenz(), TimeSettings(horizon=5000.0), SolverSettings(max_seconds=1.0))
@@ -276,6 +327,23 @@ def test_an_output_may_switch_together_with_a_function_of_time():
     assert error.max() < 1e-11
 
 
+@pytest.mark.parametrize(("width", "where", "horizon", "unit"), [
+    (3e-4, 1.7, 2.0, 1.0), (1e-4, 1.1, 1.5, 1e12),
+])
+def test_a_narrow_pulse_that_an_output_passes_is_seen(width, where, horizon, unit):
+    """In a closer look along the solution; an iterate that is not finite warns of nothing."""
+    pulse = f"{unit}*exp(-((y - {where})/{width})**2)"
+    system = plant_from_mapping({
+        "name": "pulse", "states": ["s", "x"], "outputs": ["y"], "E": [[1, 0], [0, 1]],
+        "A": [[0, 0], [0, 0]], "phi": ["1 + 0.1*sin(y)", f"{pulse}*(1 + 0.1*sin(y))"],
+        "C": [[1, 0]], "initial_state": [0, 0],
+    })
+    found = simulate(system, TimeSettings(horizon=horizon), SolverSettings(tol=1e-9))
+    area = found.signals.states.final[1] / unit
+    assert area == pytest.approx(width * np.sqrt(np.pi), rel=1e-8)
+    assert found.bounded
+
+
 def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     """A transistor that is off; one that conducts has its conductance."""
     plant = plant_from_mapping({
@@ -291,14 +359,15 @@ def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     assert c.A[0, 0, 1].tolist() == [0.0, -1.0]
 
 
-@pytest.mark.parametrize(("plant", "near"), [
-    ({"A": [["y"]]}, 1e-6),  # x' = x² from 1 is beyond all numbers at t = 1
-    ({"A": [[0]], "phi": ["-1/(2*y)"]}, 1e-6),  # x = sqrt(1 − t)
+@pytest.mark.parametrize(("plant", "near", "power"), [
+    ({"A": [["y"]]}, 1e-6, -1.0),  # x' = x² from 1 is beyond all numbers at t = 1
+    ({"A": [[0]], "phi": ["-1/(2*y)"]}, 1e-6, 0.5),  # x = sqrt(1 − t)
     # 0 = y z − 1 with y = x = 1 − t: at t = 1 nothing determines z.
     ({"states": ["x", "z"], "E": [[1, 0], [0, 0]], "A": [[0, 0], [0, "y"]], "phi": [-1, -1],
-      "C": [[1, 0]], "initial_state": [1, 1]}, 1e-3),
+      "C": [[1, 0]], "initial_state": [1, 1]}, 1e-3, -1.0),
 ])
-def test_where_a_solution_ends_is_named_with_its_time(plant, near, monkeypatch):
+def test_where_a_solution_ends_is_named_with_its_time_and_state(plant, near, power, monkeypatch):
+    """The largest state there is a power of 1 − t."""
     real, failed = simulation.simulate.solve, []
 
     def solve(*args, **options):
@@ -311,8 +380,23 @@ def test_where_a_solution_ends_is_named_with_its_time(plant, near, monkeypatch):
     monkeypatch.setattr(simulation.simulate, "solve", solve)
     with pytest.raises(GpeboError, match="beyond t = ") as caught:
         simulate(plant_from_mapping(one_state(**plant)), TimeSettings(horizon=3.0), SOLVER)
-    assert float(str(caught.value).split("beyond t = ")[1].split()[0]) == pytest.approx(1, abs=near)
+    told = re.search(r"beyond t = (\S+) \((\w) = (\S+) there\)", str(caught.value))
+    assert float(told[1]) == pytest.approx(1, abs=near)
+    assert told[2] == ("z" if "states" in plant else "x")
+    assert float(told[3]) == pytest.approx((1.0 - float(told[1])) ** power, rel=0.1)
     assert not failed  # iterates that grow without bounds are not solved: that takes long
+
+
+def test_what_is_refused_beyond_the_end_of_a_solution_is_not_its_reason():
+    """x' = x² ends at t = 1; longer windows, tried before, came to a zero divisor at t = 2.5."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "s", "z"], "outputs": ["y", "w"], "E": np.eye(3).tolist(),
+        "A": [["y", 0, 0], [0, 0, 0], [0, 0, -1]], "phi": [0, 1, "1/(w - 2.5)"],
+        "C": [[1, 0, 0], [0, 1, 0]], "initial_state": [1, 0, 0],
+    })
+    said = r"beyond t = 0\.9999\d+ .* there\): Newton's method does not converge"
+    with pytest.raises(SolverError, match=said):
+        simulate(system, TimeSettings(horizon=3.0), SOLVER)
 
 
 @pytest.mark.parametrize(("half", "then", "slows"), [
@@ -324,7 +408,8 @@ def test_windows_that_shrink_towards_a_time_are_refused_early(half, then, slows)
     """Of 90 s allowed 4 have led to t = 0.999 of 10; the last two of these from ``half``."""
     time, spent = TimeSettings(horizon=10.0), [(0.0, 0.0), (2.0, half)]
     spent += zip([3.0, 3.5, 4.0], then, strict=True)
-    refused = pytest.raises(SolverError, match=r"slows down towards t = 0\.999")
+    said = r"the first 0\.999 s took 4 s, and it slows down towards t = 0\.999\)"
+    refused = pytest.raises(SolverError, match=said)
     with refused if slows else nullcontext():
         _refuse_slow(lorenz(), time, spent, 90.0)
 
@@ -338,10 +423,31 @@ def test_iterates_go_on_as_long_as_they_will_do(share, most):
         solved.append(len(solved))
         return Trajectory(mesh, np.full((1, 6, 3), 1.0 + share ** len(solved)))
 
-    done = pytest.raises(SolverError, match="does not converge") if most == 8 else nullcontext()
+    said = r"does not converge between t = 2 and t = 3\.5$"
+    done = pytest.raises(SolverError, match=said) if most == 8 else nullcontext()
     with done:
-        _window(lorenz(), TimeSettings(horizon=1.0), SOLVER, solve)
+        _window(lorenz(), TimeSettings(start=2.0, horizon=1.5), SOLVER, solve)
     assert most - 4 <= len(solved) <= most
+
+
+@pytest.mark.parametrize(("changes", "work", "expected"), [
+    ([2e-2, 1e-4, 1e-7], 2.0, 1e-12),  # ten squares of each make the next: ten of 1e-14
+    ([1e-3, 1e-7], 1 + 2 / 3, 1e-13),  # it fell faster: one square
+    ([1e-3, 1e-5, 0.0], 2 + 2 / 3, 0.0),
+])  # fmt: skip
+def test_the_change_of_one_more_iterate_is_expected_from_those_before(changes, work, expected):
+    """Ten times what their squares say; up to a change of 1e-2 they have four digits of twelve."""
+    mesh, values = Mesh(np.array([0.0, 1.0]), radau_rule(5)), [2.0]
+    for change in changes:
+        values.append(values[-1] / (1.0 - change))
+    solved = iter(values)
+
+    def solve(*_):
+        return Trajectory(mesh, np.full((1, 6, 3), next(solved)))
+
+    _, count, cost, last = _window(lorenz(), TimeSettings(horizon=1.0), SOLVER, solve)
+    assert (count, cost) == (len(values), pytest.approx(work))
+    assert last == pytest.approx(expected, rel=1e-2, abs=0.0)
 
 
 def test_a_pole_of_time_is_named_before_windows_shrink_towards_it():
@@ -536,6 +642,19 @@ def test_instants_of_iterates_before_leave_no_edges():
     np.testing.assert_allclose(found.signals.states(t), truth, rtol=0, atol=1e-13)
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_short_elements_of_a_guess_have_edges_where_it_jumps(unit):
+    """At 2.05 beside one of 0.05, not at 1.0 and 1.1; longer ones keep theirs, in any unit."""
+    system = plant_from_mapping(one_state(A=[["-y"]]))
+    mesh = Mesh(unit * np.array([0.0, 1.0, 1.1, 2.0, 2.05, 3.0, 3.6, 4.0]), radau_rule(9))
+    guess = np.sin(mesh.points / unit) + (mesh.inside > 2.05 * unit)
+    linear = Linearised(system, Trajectory(mesh, guess[..., None]))
+    for edges, jump in ([0.0, 4.0], 2.05), ([0.0, 2.045, 4.0], 2.045):
+        found, bounded = linear.resolved(unit * np.array(edges))
+        np.testing.assert_allclose(found / unit, [0.0, jump, 3.0, 3.6, 4.0], rtol=1e-12)
+        assert bounded
+
+
 def test_derivatives_of_what_follows_outputs_have_all_digits():
     """Differences left 1e-10, which hid the rank of rows that cancel: index 3 was refused."""
     system = plant_from_mapping({
@@ -554,9 +673,9 @@ def test_derivatives_along_very_short_elements_are_no_rounding():
         "name": "short", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [["y"]], "C": [[1]],
         "initial_state": [0.0],
     })
-    mesh = Mesh(np.array([0.0, 0.5, 1.0, 1.0 + 1e-9, 1.5, 2.0]), radau_rule(9))
+    mesh = Mesh(np.array([0.0, 1e-9, 0.5, 1.0, 1.0 + 1e-9, 1.5, 2.0, 2.0 + 1e-9]), radau_rule(9))
     guess = Trajectory(mesh, np.sin(mesh.points)[..., None])
-    t = np.array([0.7, 1.0 + 5e-10, 1.2])
+    t = np.array([5e-10, 0.7, 1.0 + 5e-10, 1.2, 2.0 + 5e-10])
     phi = Linearised(system, guess).taylor(t, 2).phi[:, :, 0]
     # x y along the guess, less what stands in A there: −sin² t
     want = np.stack([-np.sin(t) ** 2, -np.sin(2 * t), -np.cos(2 * t)])

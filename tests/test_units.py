@@ -65,6 +65,11 @@ def test_a_simulation_is_the_same_in_any_units(name, decades):
     size = np.where(size > 0.0, size, 1e-6 * size.max())
     assert (np.abs(b.states / units.states - a.states) <= 1e-9 * size).all()
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+    # Rounding of other numbers is other rounding, but as large; so are elements.
+    heard = np.abs(a.states).max(axis=0) > 1e-9 * size.max()
+    apart = np.log(b.state_errors[heard] / a.state_errors[heard])
+    assert np.abs(apart).max() < np.log(15.0)
+    assert b.elements <= 1.5 * a.elements
 
 
 def doubt_of_t_c(a):

@@ -140,10 +140,11 @@ def solve(
         march = by_factors(A) if full else by_elimination
     else:
         parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh.size), units) / LENGTH)
-        if not np.maximum(parts, 1.0).sum() <= min(MOST_ELEMENTS, max_elements):
+        parts = np.maximum(parts, 1.0)
+        if not parts.sum() <= min(MOST_ELEMENTS, max_elements):
             return None
-        if parts.max(initial=1.0) > 1.0:
-            mesh = mesh.split(np.maximum(parts, 1.0).astype(np.intp))[0]
+        if parts.max() > 1.0:
+            mesh = mesh.split(parts.astype(np.intp))[0]
     del A  # another one would be as much again
 
     def evaluate(mesh: Mesh, before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:

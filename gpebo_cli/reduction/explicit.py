@@ -270,7 +270,7 @@ class _Equations:
         row = self.row(i)
         sizes = {k: _size(row[k]) * self.units[k] for k in allowed}
         if not sizes:
-            raise UndecidedError
+            raise UndecidedError  # an equation that says nothing
         largest = max(sizes.values())
         smallest = {k: float(np.abs(row[k][0]).min()) * self.units[k] for k in sizes}
         fit = [
@@ -393,8 +393,6 @@ def _without_others(
         }
         least = min(counts.values())
         for i in [i for i, count in counts.items() if count == least]:
-            if not A.row(i):
-                raise UndecidedError  # an equation that says nothing
             free = [k for k in A.row(i) if k not in equation_of]
             if not free and least < len(A.units):
                 continue

@@ -150,10 +150,11 @@ def _sample(
 
         t = mesh.points[first:last].ravel()
         unique, where = np.unique(t, return_inverse=True)
-        solution = solve_ivp(
-            derivative, (left, right), state.ravel(), method="DOP853", t_eval=unique,
-            rtol=tol, atol=tol * 1e-2 * float(np.abs(state).max(initial=1e-3)),
-        )
+        with np.errstate(over="ignore", invalid="ignore"):  # of what grows, which fails below
+            solution = solve_ivp(
+                derivative, (left, right), state.ravel(), method="DOP853", t_eval=unique,
+                rtol=tol, atol=tol * 1e-2 * float(np.abs(state).max(initial=1e-3)),
+            )
         if not solution.success:
             reached = solution.t[-1] if len(solution.t) else left
             raise SolverError(

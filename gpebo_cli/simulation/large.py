@@ -17,6 +17,7 @@ from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
     SHARE,
     Kind,
@@ -125,8 +126,7 @@ class _Plant:
                 if isinstance(self.form, Explicit) and values.A.shape[2] > self.system.n:
                     self.moved = self.form.moved  # of many values it pays to know that
                 # Nothing else of E and A is needed now, nor of what others are parts of.
-                A = values.A[:1]
-                A = np.maximum(A.max(axis=1, keepdims=True), -A.min(axis=1, keepdims=True))
+                A = largest_over_time(values.A[0])[None, None]
                 values = values._replace(E=values.E[:, :1], A=A)
                 kept = Coefficients(*(np.array(value[:1]) for value in values))
                 self.found = self.found._replace(values=kept, moved={})
@@ -353,7 +353,7 @@ def _result(
     wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail
     wrong += VALUE * EPS * form.loss * made_of
     scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), _TINY)
-    state_errors = np.where(wrong > 0.0, wrong / scale, 0.0)
+    state_errors = wrong / scale
     at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((0, len(x0)))
     jumps = [(float(mesh.edges[k]), x[k - 1, -1], Jump(x[k, 0], none)) for k in at]
     return Simulation(

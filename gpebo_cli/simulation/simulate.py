@@ -72,7 +72,8 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         structure = dense_structure(linear, window, settings)
         if structure.growth > growth:
             return None
-        last[:] = [_solved(linear, window, settings, structure)]
+        with np.errstate(all="ignore"):  # an iterate need not be finite
+            last[:] = [_solved(linear, window, settings, structure)]
         return last[0].signals.states
 
     plant, source, before = system, cast(FollowsSignals, system.coefficients), None
