@@ -19,15 +19,20 @@ SIZES = np.array([2.0, 1.0, 3.0]), np.array([1.0, 0.5, 4.0, 0.0])
 
 
 def recorded(rng):
-    """Two cases of three parameters and four states; one of each nobody knows, or at the end."""
+    """Two cases of three parameters and four states, one of each unknown at the end.
+
+    One error falls within a step, one is zero, and one never falls.
+    """
     p, n = 3, 4
     offset, gain = (
         Trajectory(MESH, rng.normal(size=(*MESH.points.shape, *shape))) for shape in ((n,), (n, p))
     )
     truth, state_map = rng.normal(size=p) * np.ones((41, 1)), AffineStateMap(offset, gain)
-    fall = np.exp(-rng.uniform(1.5, 3.0, (2, 1, p)) * (GRID[:, None] - 2.0))
-    eta, x = truth + rng.normal(size=(2, 1, p)) * fall, state_map.at(GRID)(truth[None])[0]
-    truth[:, 1], x[-1, 1] = np.nan, np.nan
+    rates = np.array([[60.0, 2.0, 3.0], [0.0, 2.0, 0.0]])[:, None]
+    first = np.array([[2.0, -1.0, 0.7], [0.0, -0.5, 0.4]])[:, None]
+    eta = truth + first * np.exp(-rates * (GRID[:, None] - 2.0))
+    x = state_map.at(GRID)(truth[None])[0]
+    truth[-1, 1], x[-1, 1] = np.nan, np.nan
     return state_map, truth, x, eta
 
 
@@ -54,9 +59,9 @@ def test_metrics_are_the_same_whatever_is_affine(judged):
     np.testing.assert_allclose(measured(plain, truth, x, eta, judged)[0], found, rtol=1e-9)
     few, _ = measured(state_map, truth, x, eta, judged, each=False)
     np.testing.assert_allclose(few, found[:5], rtol=1e-12)
-    metrics = accuracy.metrics_of(
-        found, ["a", "b", "c"], SimpleNamespace(states=("w", "x", "y", "z"))
-    )
+    names = ["a", "b", "c"], SimpleNamespace(states=("w", "x", "y", "z"))
+    metrics = accuracy.metrics_of(found, *names)
+    assert accuracy.metrics_of(few, *names).seconds_to_1pct == {}
     of_eta, of_x = np.abs(eta - truth), np.abs(x_hat - x)
     some = np.array([0, 2])[judged[[0, 2]]]
     expected = of_eta[:, -1, some].max(axis=1, initial=0.0)
@@ -67,11 +72,15 @@ def test_metrics_are_the_same_whatever_is_affine(judged):
     squares = (of_x[..., [0, 2]] ** 2 / SIZES[1][[0, 2]] ** 2).sum(axis=2)  # z has no size
     rms = np.sqrt(np.trapezoid(squares, GRID) / 4.0)
     np.testing.assert_allclose(metrics.rms_error_states, rms, rtol=1e-9)
-    unknown = {"b": True, "x": True, "a": not judged[0], "c": not judged[2], "w": False, "y": False}
-    for name, never in unknown.items():
-        assert (np.isnan(metrics.seconds_to_1pct[name]) == never).all()
-    assert (metrics.seconds_to_1pct_parameters > 0.0).all() == judged.any()
-    assert (metrics.seconds_to_1pct_states > 0.5).all()
+    seconds = metrics.seconds_to_1pct
+    a, c = np.array([np.log(100.0) / 60.0, 0.0]), np.array([np.log(100.0) / 3.0, np.nan])
+    np.testing.assert_allclose(seconds["a"], a if judged[0] else np.nan)
+    np.testing.assert_allclose(seconds["c"], c if judged[2] else np.nan)
+    assert np.isnan([seconds["b"], seconds["x"]]).all()
+    assert (metrics.seconds_to_1pct_parameters[0] > 0.0) == judged.any()
+    for of_state in (metrics.seconds_to_1pct_states, seconds["w"], seconds["y"]):
+        assert of_state[0] > 0.5
+        assert np.isnan(of_state[1])
 
 
 def settled_by_hand(t, away, level):
