@@ -940,6 +940,26 @@ def test_a_gain_that_makes_up_for_rounding_does_not_break_the_scalar_law(gain):
         found[0, -1], [1.4, -2.0] + reached * np.array([-0.4, 3.0]), atol=1e-5)
 
 
+@pytest.mark.parametrize("digits", [1.0, 1e-7])
+@pytest.mark.parametrize("gain", [0.3, 1e4])
+def test_the_sign_of_delta_decides_nothing(gain, digits):
+    """Rows of Ω in another order turn it and 𝐘; the elements are the same ones then, too."""
+    mesh, t = initial_mesh(0.0, 4.0, [], 6, radau_rule(4)), np.linspace(0.0, 4.0, 9)
+    found = []
+    for sign in (1.0, -1.0):
+        def signals(t, inside, sign=sign):
+            delta = sign * (0.2 + np.sin(2.0 * t))
+            eta = np.stack([1.0 + 0.1 * np.sin(t), -3.0 + digits * np.cos(40.0 * t)], axis=1)
+            return delta, delta[:, None] * eta, np.full(len(t), digits)
+
+        delta, Y, known = (
+            x.reshape(*mesh.points.shape, *x.shape[1:]) for x in signals(mesh.points.ravel(), 0)
+        )
+        path = scalar_path(mesh, signals, delta, known, Y / delta[..., None], t, 0.0)
+        found.append(scalar_law(path, np.array([2.0, 1.0]), np.array([[gain]])))
+    np.testing.assert_array_equal(*found)
+
+
 def test_so_they_are_of_several_recordings(tmp_path):
     files = [tmp_path / name for name in ("a.csv", "b.csv")]
     signals = gpebo_cli.run("descriptor", observer="none").details.simulation

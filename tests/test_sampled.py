@@ -19,7 +19,13 @@ from test_observer import ROTATING
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
-from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
+from gpebo_cli.estimators._recursive import (
+    KreisselmeierFilter,
+    ScalarLaw,
+    mix_sampled,
+    quotient_of,
+    spectrum,
+)
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
@@ -432,6 +438,20 @@ def test_means_at_samples_are_sums_over_the_samples(perturbed):
             eta = goal + np.exp(-gain * delta**2 * block.steps[k]) * (eta - goal)
         expected.append(eta)
     np.testing.assert_allclose(made.parameters[0], expected, atol=1e-9)
+
+
+def test_what_is_rounding_of_mixing_is_not_used():
+    """Neither of rows that are one but for rounding, nor where Δ is too small for a number."""
+    one = np.ones((2, 2)) + np.diag([0.0, 3e-16])
+    extended = np.array([
+        np.column_stack([omega, omega @ [2.0, -1.0]])
+        for omega in (np.eye(2), one, 1e-170 * np.eye(2), -np.eye(2))
+    ])
+    found = mix_sampled(extended, None)
+    np.testing.assert_array_equal(found.usable[:, 0], [True, False, False, True])
+    np.testing.assert_array_equal(
+        found.quotient[:, 0], [[2.0, -1.0], [0.0, 0.0], [0.0, 0.0], [2.0, -1.0]]
+    )
 
 
 MONOTONE = {

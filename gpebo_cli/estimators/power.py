@@ -211,7 +211,7 @@ class PowerEstimates(MixedEstimates):
             diagonal = np.einsum("nii->ni", J)  # a view
             diagonal += np.maximum(root * size ** (root - 1.0), still)
             # Where nothing is left of Δ and r nothing moves.
-            diagonal += np.abs(J).max(axis=2) <= _NOTHING
+            diagonal += J.max(axis=2) <= _NOTHING
             F = np.copysign(size**root, w) + delta * moved - rest
             w, before = w - np.linalg.solve(J, F[..., None])[..., 0], moved
         return np.concatenate([eta[:, None], eta[:, None] + moved], axis=1), change
