@@ -431,6 +431,38 @@ def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, sett
         run("window", **settings)
 
 
+@pytest.mark.parametrize("given", [
+    {"estimator": {"name": "ls_drem", "gamma": [1.0, 3.0], "beta": 0.3}, "seeds": 2},
+    {"estimator": {"name": "drem", "gamma": [1e3, 1e5]}, "sample_time": 0.1},
+    {"estimator": {"name": "power", "gamma": [1e3, 1e5]}},
+])
+def test_how_much_is_held_at_once_changes_no_result(monkeypatch, given):
+    noise = {"name": "gaussian", "outputs": 0.1, "sample_time": 0.25}
+    observer = {"name": "gpebo", **{k: v for k, v in given.items() if k == "sample_time"}}
+
+    def found():
+        details = run(
+            "descriptor", estimator=given["estimator"], observer=observer,
+            noise=noise | {k: v for k, v in given.items() if k == "seeds"},
+            time={"horizon": 1.0, "samples": 9},
+        ).details
+        own, seeds = details.estimation, details.noise
+        return [own.parameters, own.states, own.delta, *details.metrics.columns.values(),
+                *(x for x in (own.parameters_std, own.states_std) if x is not None),
+                *([] if seeds is None else [seeds.bias, seeds.deviation, seeds.rms])]
+
+    whole = found()
+    for name, count in {
+        "estimators._scalar._LANES": 1, "estimators._scalar._STRETCH": 3,
+        "estimators.ls_drem._AT_ONCE": 3, "estimators.power._STRETCH": 3,
+        "evidence.uncertainty._CHUNK": 1, "experiment.estimation._BATCH": 1,
+        "experiment.estimation._SAMPLES_AT_ONCE": 7, "experiment.seeds._NUMBERS": 1,
+    }.items():
+        monkeypatch.setattr(f"gpebo_cli.{name}", count)
+    for one, other in zip(found(), whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
 def test_a_loop_tells_which_share_of_it_is_done():
     shares = []
     loop = paced(4, "cases", 1e9, shares.append)

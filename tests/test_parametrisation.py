@@ -203,16 +203,21 @@ def test_the_monotone_gradient_against_an_integration_of_its_odes():
     np.testing.assert_allclose(made.parametrisation.fitted(eta, weight), expected, atol=1e-6)
 
 
-def test_the_monotone_gradient_of_one_unknown_begins_where_it_should():
-    """With ψ = 1 a filter has Δ = 1 − e^(−λt) and η̄ is θ from the start on."""
-    one = {"name": "one", "unknowns": {"a": 2.0}, "box": {"a": [0, 8]}, "S": ["a"], "psi": [["1"]]}
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_the_monotone_gradient_of_one_unknown_begins_where_it_should(unit):
+    """With ψ = 1 a filter has Δ = 1 − e^(−λt) and η̄ is θ from the start on; in any unit of θ."""
+    one = {
+        "name": "one", "unknowns": {"a": 2.0 * unit}, "box": {"a": [0, 8.0 * unit]},
+        "S": [f"a/{unit}"], "psi": [["1"]],
+    }
     made = run(
         regression=one, time={"horizon": 3, "samples": 31},
-        estimator={"name": "monotone", "gamma": 1.5, "lambda": 4.0},
+        estimator={"name": "monotone", "gamma": 1.5, "lambda": 4.0, "T": [[unit]]},
     )
     x = np.exp(-4.0 * made.t)
     energy = made.t - (1.0 - x) / 2.0 + (1.0 - x**2) / 8.0
-    np.testing.assert_allclose(made.estimates["a"][0], 2.0 + 2.0 * np.exp(-1.5 * energy), atol=1e-9)
+    found = made.estimates["a"][0] / unit
+    np.testing.assert_allclose(found, 2.0 + 2.0 * np.exp(-1.5 * energy), atol=1e-9)
 
 
 def test_errors_of_the_monotone_gradient_are_its_linearisation():

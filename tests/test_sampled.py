@@ -334,6 +334,7 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     """Two rows alone, then three: from the sample on which the third wakes, all start anew."""
     block, rates = regression(K=40, r=3, hold="linear"), np.array([0.5, 1.0, 2.0])
     block.rows[:, 2] = 0.0
+    block.rows[:, 0, 1] = 0.0  # one of its numbers is not the row
     two = replace(block, rows=block.rows[:, :2])
     own, alone = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
     np.testing.assert_array_equal(own.update(block), alone.update(two))
