@@ -338,6 +338,7 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     two = replace(block, rows=block.rows[:, :2])
     own, alone = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
     np.testing.assert_array_equal(own.update(block), alone.update(two))
+    assert (alone.seen(two)[1] == np.eye(2)[[0, 1, 0]]).all()
     block.rows[20:] = regression(K=20, r=3, hold="linear").rows
     part = replace(block, t=block.t[19:], steps=block.steps[19:], rows=block.rows[19:])
     own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
