@@ -29,7 +29,7 @@ def recorded(rng):
     )
     truth, state_map = rng.normal(size=p) * np.ones((41, 1)), AffineStateMap(offset, gain)
     rates = np.array([[60.0, 2.0, 3.0], [0.0, 2.0, 0.0]])[:, None]
-    first = np.array([[2.0, -1.0, 0.7], [0.0, -0.5, 0.4]])[:, None]
+    first = np.array([[2.0, -1.0, -0.7], [0.0, -0.5, 0.4]])[:, None]
     eta = truth + first * np.exp(-rates * (GRID[:, None] - 2.0))
     x = state_map.at(GRID)(truth[None])[0]
     truth[-1, 1], x[-1, 1] = np.nan, np.nan

@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import sys
+import time
 from html import escape
 
 import matplotlib.pyplot as plt
@@ -461,6 +462,13 @@ def test_how_much_is_held_at_once_changes_no_result(monkeypatch, given):
         monkeypatch.setattr(f"gpebo_cli.{name}", count)
     for one, other in zip(found(), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_stages_take_a_part_of_the_time_that_all_takes():
+    since = time.perf_counter()
+    timings = run("window", time={"horizon": 1.0}).details.timings
+    assert 0.0 < sum(timings.values()) < time.perf_counter() - since
+    assert min(timings.values()) >= 0.0
 
 
 def test_a_loop_tells_which_share_of_it_is_done():

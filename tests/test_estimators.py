@@ -636,9 +636,12 @@ def test_what_is_required_is_that_of_the_first_segment_that_has_it(gamma, first,
         assert found.evidence == pytest.approx(required(6.0).evidence, rel=1e-6)
 
 
-def test_a_gain_that_is_auto_is_not_for_samples():
+def test_a_gain_that_is_auto_is_not_for_samples_and_resets():
     with pytest.raises(ConfigError, match="auto needs to know the signals to their end"):
         estimators.build({"name": "drem", "gamma": "auto"}).recursive(["a"])
+    for own in ({"remedy": "reset", "reset_times": [5.0]}, {"remedy": "current_coordinates"}):
+        with pytest.raises(ConfigError, match=r"auto needs to know .*; give a number with resets"):
+            gpebo_cli.run("descriptor", estimator="drem", gamma="auto", observer=own)
 
 
 # --- gains ----------------------------------------------------------------------------------

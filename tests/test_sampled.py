@@ -413,6 +413,33 @@ def test_the_gradient_law_is_solved_exactly_over_each_sample(gain, hold):
     assert recursion.requirement.holds == (left <= 0.01)
 
 
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_new_regressor_is_rotated_over_each_sample(hold):
+    """By φ' = κΔ²(π/2 − φ) in all, about −𝐘/Δ as it is there or in the middle."""
+    block = regression(K=25, hold=hold)
+    mixed = mix_sampled(KreisselmeierFilter(np.ones(3)).update(block), None)
+    weight, eta = mixed.delta[:, 0] ** 2, mixed.quotient[:, 0]
+    kappa = 1.0 / float(block.steps @ weight)
+    made = estimators.build({"name": "exciting", "kappa": kappa, "lambda": 1.0}).recursive("abc")
+    found = made._mixing(block)  # Φ_21 and e_2/Φ_21
+    phi, c = 0.0, np.zeros((2, 3))
+    for k, step in enumerate(block.steps):
+        if not mixed.usable[k]:
+            continue
+        both = hold == "linear" and k and mixed.usable[k - 1]
+        energy = step * (0.5 * (weight[k] + weight[k - 1] * (k > 0)) if hold == "linear"
+                         else weight[k])
+        towards = 0.5 * (eta[k] + eta[k - 1]) if both else eta[k]
+        delta = (0.5 * np.pi - phi) * -np.expm1(-kappa * energy)
+        phi += delta
+        turn = np.array([[np.cos(delta), -np.sin(delta)], [np.sin(delta), np.cos(delta)]])
+        about = np.stack([towards, 0.0 * towards])
+        c = turn @ (c + about) - about
+        assert found.delta[k, 0] == pytest.approx(np.sin(phi), abs=1e-12)
+        np.testing.assert_allclose(found.quotient[k, 0] * np.sin(phi), c[1], atol=1e-10)
+    assert 0.1 < phi < 1.57
+
+
 @pytest.mark.parametrize("perturbed", [None, ["b"]])
 def test_means_at_samples_are_sums_over_the_samples(perturbed):
     block, delay, settle, gain = regression(K=50), 0.7, 0.4, 3.0
