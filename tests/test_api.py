@@ -38,6 +38,7 @@ from gpebo_cli import (
 )
 from gpebo_cli.api.choice import choose, default
 from gpebo_cli.experiment.limits import paced
+from gpebo_cli.findings import replaced
 
 
 @pytest.fixture(scope="module")
@@ -462,6 +463,12 @@ def test_how_much_is_held_at_once_changes_no_result(monkeypatch, given):
         monkeypatch.setattr(f"gpebo_cli.{name}", count)
     for one, other in zip(found(), whole, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_a_result_without_signals_says_what_it_needs():
+    details = run("window", time={"horizon": 1.0}).details
+    with pytest.raises(ValueError, match="a result needs a simulation or a recording"):
+        _ = replaced(details, simulation=None).signals
 
 
 def test_stages_take_a_part_of_the_time_that_all_takes():

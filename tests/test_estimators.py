@@ -913,7 +913,9 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
             estimator=slow | {"gamma": gamma}, observer={"name": "gpebo"},
             data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
-        online.feed(*rows)
+        made = online.feed(*rows)
+        last = online.last_states(made.parameters[:, -1])[:, 0]
+        np.testing.assert_allclose(last, made.states[:, -1], rtol=1e-9)
         said, known = stream_verdict(online), online.excitation()
         assert ("least squares over the same data" in said) == warned
         assert said.startswith(f"{len(signals.t)} rows, t = 0 to 20; interval-exciting from t = ")
