@@ -395,6 +395,16 @@ def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model
     assert "missing or wrong parameter" not in result.verdict
 
 
+@pytest.mark.parametrize("rate", [0.5, -0.5])
+def test_what_is_not_determined_at_the_end_is_told_and_nothing_else(rate):
+    """Of a + b only the sum is known; where Φ grows, what was known before counts as well."""
+    plant = one_state(unknowns={"a": 0.5, "b": 0.3}, A=[[rate]], F=[[1, 1]])
+    result = run(plant, time={"horizon": 8.0})
+    assert "; not determined by the data: a, b; state error" in result.verdict
+    assert np.isnan([result.estimates["a"], result.estimates["b"]]).all()
+    assert np.isfinite([result.estimates["e0_x"], result.estimates["x"]]).all()
+
+
 def test_a_state_that_the_observer_leaves_out_is_not_called_estimable():
     result = run("canonical", observer="canonical", time={"horizon": 5})
     assert np.isnan(result.estimates["zb3"]).all()
