@@ -16,6 +16,7 @@ from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 
+import gpebo_cli
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
@@ -274,7 +275,11 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     f0, alpha, beta = 0.3, 2.0, 0.4
     settings = {"name": "least_squares", "f0": f0, "alpha": alpha, "beta": beta, "initial": 0.7}
     recursion = estimators.build(settings).recursive(["a", "b", "c"])
-    estimate = recursion.update(block).parameters[0, -1]
+    made = recursion.update(block)
+    estimate = made.parameters[0, -1]
+    assert recursion.requirement.holds
+    assert made.met[-1]
+    assert not made.met[0]  # two rows for three parameters
     age = block.t[-1] - block.t
     weight = np.exp(-beta * age)
     rows = block.weighted() * np.sqrt(alpha * weight)[:, None, None]
@@ -438,6 +443,23 @@ def test_the_new_regressor_is_rotated_over_each_sample(hold):
         assert found.delta[k, 0] == pytest.approx(np.sin(phi), abs=1e-12)
         np.testing.assert_allclose(found.quotient[k, 0] * np.sin(phi), c[1], atol=1e-10)
     assert 0.1 < phi < 1.57
+
+
+@pytest.mark.parametrize("name", ["mre", "gradient"])
+def test_errors_never_grow_beside_a_regressor_that_does(name):
+    """Of ψ that grows to e^80 few digits are known in most directions: there nothing is learned."""
+    growing = {
+        "name": "growing", "states": ["x1", "x2", "x3"], "outputs": ["y"],
+        "E": np.eye(3).tolist(), "A": [[4, 1, 0], ["sin(t)", 3, 1], [0, 0, 1]],
+        "C": [[1, 0, 0]], "initial_state": [1, -1, 2],
+    }
+    found = gpebo_cli.run(
+        growing, estimator=name, observer={"name": "gpebo", "sample_time": 0.05},
+        time={"horizon": 20, "samples": 101},
+    ).details.estimation
+    assert 0.0 < found.requirement.evidence["left_of_the_initial_error"] < 1.0
+    error = np.linalg.norm(found.parameters - found.true_parameters, axis=-1)
+    assert error.max() < 1.01 * error[0, 0]
 
 
 @pytest.mark.parametrize("perturbed", [None, ["b"]])
