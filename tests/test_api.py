@@ -6,6 +6,7 @@ import io
 import itertools
 import os
 import sys
+import time
 from html import escape
 
 import matplotlib.pyplot as plt
@@ -37,6 +38,7 @@ from gpebo_cli import (
 )
 from gpebo_cli.api.choice import choose, default
 from gpebo_cli.experiment.limits import paced
+from gpebo_cli.findings import replaced
 
 
 @pytest.fixture(scope="module")
@@ -429,6 +431,51 @@ def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, sett
         monkeypatch.setattr(f"{experiment}.{name}", 1)
     with pytest.raises(GpeboError, match=f"^{what} would take some .*: solver.max_seconds="):
         run("window", **settings)
+
+
+@pytest.mark.parametrize("given", [
+    {"estimator": {"name": "ls_drem", "gamma": [1e2, 1e4]}, "seeds": 2},
+    {"estimator": {"name": "drem", "gamma": [1e3, 1e5]}, "sample_time": 0.1},
+    {"estimator": {"name": "power", "gamma": [1e3, 1e5]}},
+])
+def test_how_much_is_held_at_once_changes_no_result(monkeypatch, given):
+    noise = {"name": "gaussian", "outputs": 0.1, "sample_time": 0.25}
+    observer = {"name": "gpebo", **{k: v for k, v in given.items() if k == "sample_time"}}
+
+    def found():
+        details = run(
+            "descriptor", estimator=given["estimator"], observer=observer,
+            noise=noise | {k: v for k, v in given.items() if k == "seeds"},
+            time={"horizon": 1.0, "samples": 9},
+        ).details
+        own, seeds = details.estimation, details.noise
+        return [own.parameters, own.states, own.delta, *details.metrics.columns.values(),
+                *(x for x in (own.parameters_std, own.states_std) if x is not None),
+                *([] if seeds is None else [seeds.bias, seeds.deviation, seeds.rms])]
+
+    whole = found()
+    for name, count in {
+        "estimators._scalar._LANES": 1, "estimators._scalar._STRETCH": 3,
+        "estimators.ls_drem._AT_ONCE": 3, "estimators.power._STRETCH": 3,
+        "evidence.uncertainty._CHUNK": 1, "experiment.estimation._BATCH": 1,
+        "experiment.estimation._SAMPLES_AT_ONCE": 7, "experiment.seeds._NUMBERS": 1,
+    }.items():
+        monkeypatch.setattr(f"gpebo_cli.{name}", count)
+    for one, other in zip(found(), whole, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-9)
+
+
+def test_a_result_without_signals_says_what_it_needs():
+    details = run("window", time={"horizon": 1.0}).details
+    with pytest.raises(ValueError, match="a result needs a simulation or a recording"):
+        _ = replaced(details, simulation=None).signals
+
+
+def test_stages_take_a_part_of_the_time_that_all_takes():
+    since = time.perf_counter()
+    timings = run("window", time={"horizon": 1.0}).details.timings
+    assert 0.0 < sum(timings.values()) < time.perf_counter() - since
+    assert min(timings.values()) >= 0.0
 
 
 def test_a_loop_tells_which_share_of_it_is_done():

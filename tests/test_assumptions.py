@@ -51,6 +51,15 @@ def test_the_canonical_form_has_its_own_assumptions():
     assert all(a.holds for a in names.values())
 
 
+def test_a_plant_without_differential_equations_is_examined():
+    """0 = v − x = x + v and y = x + e are three equations for x, of which it takes a third of e."""
+    settings = Settings(estimator={}, observer={"name": "gpebo", "form": "given"})
+    found = examine(settings, lti(E=[[0, 0], [0, 0]]))
+    assert found.deviations == pytest.approx({"x": 1.0 / 3.0, "v": 0.0})
+    rank = next(a for a in found.assumptions if a.name == "Rank condition D2")
+    assert rank.evidence == {"rank": 2, "needed": 2}
+
+
 def test_an_unstable_unknown_input_observer_is_seen():
     """c1 < 0 turns the sign of a1 c1/c2: M_w is unstable for every gain (errata, Remark 4)."""
     names = found(
@@ -77,6 +86,26 @@ def test_constant_coefficients_get_regularity_and_the_rank_condition():
     assert not blind["Rank condition D2"].holds
     assert blind["Rank condition D2"].evidence == {"rank": 2, "needed": 3}
     assert not blind["Assumption 1"].holds
+
+
+@pytest.mark.parametrize("copies", [1, 9])
+def test_a_pencil_is_as_regular_as_where_it_is_most_so(copies):
+    """σ_min(λE − A)/‖A‖ at λ that are roots of one; of many states a bound of it at λ = ±1."""
+    E, A, C = (np.kron(np.eye(copies), block) for block in (
+        [[1.0, 0.0], [0.0, 0.0]], [[-1.0, 1.0], [1.0, 1.0]], [[1.0, 0.0]]
+    ))
+    n = len(A)
+    names = found(lti(
+        E=E.tolist(), A=A.tolist(), C=C.tolist(), states=[f"x{k}" for k in range(n)],
+        outputs=[f"y{k}" for k in range(copies)], initial_state=n * [0],
+    ))
+    if copies == 1:
+        smallest = [np.linalg.svd(np.exp(2j * np.pi * k / 3.0) * E - A)[1][-1] for k in range(3)]
+    else:
+        smallest = [1.0 / np.linalg.norm(np.linalg.inv(sign * E - A)) for sign in (1.0, -1.0)]
+    told = names["Regularity"].evidence["largest_smallest_singular_value"]
+    assert told == pytest.approx(max(smallest) / np.linalg.norm(A))
+    assert names["Rank condition D2"].evidence == dict.fromkeys(("rank", "needed"), 3 * copies)
 
 
 def test_the_pencil_is_judged_in_no_units():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import clarabel
 import numpy as np
@@ -16,7 +17,9 @@ from scipy.optimize import brentq
 from gpebo_cli import run
 from gpebo_cli.experiment import bounds as bounds_
 from gpebo_cli.experiment.result import ActiveBound
-from gpebo_cli.observers import gpebo
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import AffineStateMap, gpebo
 
 TANK = {
     "name": "tank", "states": ["h1", "h2"], "inputs": {"V": "sin(t)"}, "unknowns": {"leak": -0.05},
@@ -291,3 +294,23 @@ def test_bounds_are_told_in_the_order_of_time():
     times = [bound.time for bound in held]
     assert len(times) > 1
     assert times == sorted(times)
+
+
+def test_where_nothing_is_known_yet_the_end_says_what_is_near():
+    """With G = diag(9, 1) at the end η₁ + η₂ ≥ 1 is met at the start by (0.1, 0.9)."""
+    t, mesh = np.array([0.0, 1.0, 2.0]), Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(3))
+    ones = np.ones(mesh.points.shape)
+    gram = np.array([np.zeros((2, 2)), np.diag([1.0, 4.0]), np.diag([9.0, 1.0])])
+    observation = SimpleNamespace(
+        state_map=AffineStateMap(
+            Trajectory(mesh, 0.0 * ones[..., None]), Trajectory(mesh, np.ones((*ones.shape, 1, 2)))
+        ),
+        regression=SimpleNamespace(p=2, gram_at=lambda _: gram),
+    )
+    found = bounds_.bounded(
+        {"states": {"x": [1.0, None]}}, SimpleNamespace(states=("x",), unknowns=("a", "b")),
+        observation, np.arange(2), SimpleNamespace(parameters=lambda _: np.zeros((1, 3, 2))), t,
+    )
+    np.testing.assert_allclose(
+        found.parameters(slice(0, 1))[0], [[0.1, 0.9], [0.8, 0.2], [0.1, 0.9]], atol=1e-9
+    )

@@ -636,9 +636,12 @@ def test_what_is_required_is_that_of_the_first_segment_that_has_it(gamma, first,
         assert found.evidence == pytest.approx(required(6.0).evidence, rel=1e-6)
 
 
-def test_a_gain_that_is_auto_is_not_for_samples():
+def test_a_gain_that_is_auto_is_not_for_samples_and_resets():
     with pytest.raises(ConfigError, match="auto needs to know the signals to their end"):
         estimators.build({"name": "drem", "gamma": "auto"}).recursive(["a"])
+    for own in ({"remedy": "reset", "reset_times": [5.0]}, {"remedy": "current_coordinates"}):
+        with pytest.raises(ConfigError, match=r"auto needs to know .*; give a number with resets"):
+            gpebo_cli.run("descriptor", estimator="drem", gamma="auto", observer=own)
 
 
 # --- gains ----------------------------------------------------------------------------------
@@ -933,7 +936,9 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
             estimator=slow | {"gamma": gamma}, observer={"name": "gpebo"},
             data=DataSettings(hold="linear"), time=TimeSettings(np.nan, np.nan),
         ), shipped("descriptor"))(0.0, np.append(rows[1][0], rows[2][0]))  # fmt: skip
-        online.feed(*rows)
+        made = online.feed(*rows)
+        last = online.last_states(made.parameters[:, -1])[:, 0]
+        np.testing.assert_allclose(last, made.states[:, -1], rtol=1e-9)
         said, known = stream_verdict(online), online.excitation()
         assert ("least squares over the same data" in said) == warned
         assert said.startswith(f"{len(signals.t)} rows, t = 0 to 20; interval-exciting from t = ")
@@ -961,6 +966,26 @@ def test_a_gain_that_makes_up_for_rounding_does_not_break_the_scalar_law(gain):
     reached = np.exp(-gain * path.energy[-1, -1])
     np.testing.assert_allclose(
         found[0, -1], [1.4, -2.0] + reached * np.array([-0.4, 3.0]), atol=1e-5)
+
+
+@pytest.mark.parametrize("digits", [1.0, 1e-7])
+@pytest.mark.parametrize("gain", [0.3, 1e4])
+def test_the_sign_of_delta_decides_nothing(gain, digits):
+    """Rows of Ω in another order turn it and 𝐘; the elements are the same ones then, too."""
+    mesh, t = initial_mesh(0.0, 4.0, [], 6, radau_rule(4)), np.linspace(0.0, 4.0, 9)
+    found = []
+    for sign in (1.0, -1.0):
+        def signals(t, inside, sign=sign):
+            delta = sign * (0.2 + np.sin(2.0 * t))
+            eta = np.stack([1.0 + 0.1 * np.sin(t), -3.0 + digits * np.cos(40.0 * t)], axis=1)
+            return delta, delta[:, None] * eta, np.full(len(t), digits)
+
+        delta, Y, known = (
+            x.reshape(*mesh.points.shape, *x.shape[1:]) for x in signals(mesh.points.ravel(), 0)
+        )
+        path = scalar_path(mesh, signals, delta, known, Y / delta[..., None], t, 0.0)
+        found.append(scalar_law(path, np.array([2.0, 1.0]), np.array([[gain]])))
+    np.testing.assert_array_equal(*found)
 
 
 def test_so_they_are_of_several_recordings(tmp_path):

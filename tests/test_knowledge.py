@@ -139,6 +139,46 @@ def test_units_of_parameters_do_not_matter():
     assert not one.states(gain)[:, 2:].any()
 
 
+@pytest.mark.parametrize(("kernel", "growth"), [(True, None), (True, 1e6), (False, 1e6)])
+def test_what_is_left_of_a_state_has_no_unit_and_no_sign(kernel, growth):
+    """Neither that of a state nor of a parameter; of a kernel's part too much must not be in it.
+
+    In the kernel may stand ten times what is seen of η. Without growth a state is no smaller than
+    a thousandth of its terms, whatever they add up to.
+    """
+    rng = np.random.default_rng(5)
+    psi = rng.normal(size=(60, 4))
+    if kernel:
+        psi[:, 3] = 0.0
+    eta = np.array([1.0, -2.0, 0.5, 3.0])
+    G, h = (psi.T @ psi)[None], psi.T @ psi @ eta
+    gain = rng.normal(size=(2, 80, 4))
+    gain[..., 3] *= 10.0 ** rng.uniform(-8.0, 1.0, 80)
+    offset = rng.normal(size=(2, 80))
+    offset[:, ::2] = -gain[:, ::2] @ eta  # which leaves nothing, or little
+    offset[:, ::2] += 10.0 ** rng.uniform(-9.0, 0.0, 40)
+    known = knowledge(G, np.ones(4), np.ones(1))
+    found = known.resolved(h, offset, gain, growth)
+    z = np.linalg.pinv(G[0]) @ h
+    hidden = 10.0 * np.linalg.norm(z * np.sqrt(np.diag(G[0]))) if kernel else 0.0
+    sizes = known.sizes[-1]
+    unseen = hidden * np.abs(gain[-1, :, 3]) / sizes[3]
+    size = np.abs(offset + gain @ z).max(axis=0)
+    if growth is None:
+        size = np.maximum(size, 1e-3 * np.abs(gain[-1]) @ np.abs(z))
+    error = known.doubt(h, gain[-1])[0]
+    np.testing.assert_allclose(error, unseen, rtol=1e-6, atol=1e-9)
+    np.testing.assert_array_equal(found, error <= 1e-3 * size)
+    assert 0.1 < found.mean() < 0.97
+    of_states = 10.0 ** rng.integers(-6, 6, 80) * rng.choice([-1.0, 1.0], 80)
+    of_eta = 10.0 ** np.array([-5.0, 4.0, 0.0, 2.0]) * [1.0, -1.0, -1.0, 1.0]
+    other = knowledge(G * of_eta * of_eta[:, None], np.abs(of_eta), np.ones(1))
+    turned = gain * of_states[:, None] * of_eta
+    np.testing.assert_array_equal(
+        other.resolved(h * of_eta, offset * of_states, turned, growth), found
+    )
+
+
 CONF = Path(__file__).parents[1] / "conf"
 
 HALF_SEEN = """
@@ -353,6 +393,16 @@ def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model
     fit = result.details.fit
     assert fit.residual[0] < 1e-3 * fit.size
     assert "missing or wrong parameter" not in result.verdict
+
+
+@pytest.mark.parametrize("rate", [0.5, -0.5])
+def test_what_is_not_determined_at_the_end_is_told_and_nothing_else(rate):
+    """Of a + b only the sum is known; where Φ grows, what was known before counts as well."""
+    plant = one_state(unknowns={"a": 0.5, "b": 0.3}, A=[[rate]], F=[[1, 1]])
+    result = run(plant, time={"horizon": 8.0})
+    assert "; not determined by the data: a, b; state error" in result.verdict
+    assert np.isnan([result.estimates["a"], result.estimates["b"]]).all()
+    assert np.isfinite([result.estimates["e0_x"], result.estimates["x"]]).all()
 
 
 def test_a_state_that_the_observer_leaves_out_is_not_called_estimable():

@@ -144,6 +144,17 @@ def test_the_seed_decides():
     assert np.abs(one.outputs.values - two.outputs.values).max() > 0.1
 
 
+@pytest.mark.parametrize("sample_time", [0.1, 4.0 / 39.0])
+def test_the_error_at_the_end_is_not_that_of_the_start(sample_time):
+    """Though the samples are continued periodically, an even or an odd number of them."""
+    signals, measured = seen(
+        shipped("descriptor"), outputs=0.1, sample_time=sample_time, shape="band_limited", seed=2
+    )
+    mesh = measured.outputs.mesh
+    errors = measured.outputs.values - mesh.along(signals.outputs).values
+    assert abs(errors[-1, -1, 0] - errors[0, 0, 0]) > 1e-3
+
+
 def test_quantisation_rounds_what_is_sampled():
     signals, measured = seen(shipped("descriptor"), quantisation=0.25, sample_time=0.1)
     t = 0.1 * np.arange(40)

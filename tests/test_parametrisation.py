@@ -203,6 +203,23 @@ def test_the_monotone_gradient_against_an_integration_of_its_odes():
     np.testing.assert_allclose(made.parametrisation.fitted(eta, weight), expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-6])
+def test_the_monotone_gradient_of_one_unknown_begins_where_it_should(unit):
+    """With ψ = 1 a filter has Δ = 1 − e^(−λt) and η̄ is θ from the start on; in any unit of θ."""
+    one = {
+        "name": "one", "unknowns": {"a": 2.0 * unit}, "box": {"a": [0, 8.0 * unit]},
+        "S": [f"a/{unit}"], "psi": [["1"]],
+    }
+    made = run(
+        regression=one, time={"horizon": 3, "samples": 31},
+        estimator={"name": "monotone", "gamma": 1.5, "lambda": 4.0, "T": [[unit]]},
+    )
+    x = np.exp(-4.0 * made.t)
+    energy = made.t - (1.0 - x) / 2.0 + (1.0 - x**2) / 8.0
+    found = made.estimates["a"][0] / unit
+    np.testing.assert_allclose(found, 2.0 + 2.0 * np.exp(-1.5 * energy), atol=1e-9)
+
+
 def test_errors_of_the_monotone_gradient_are_its_linearisation():
     made, *_ = given()
     t, small = np.linspace(0.0, 6.0, 13), 1e-6
@@ -283,10 +300,11 @@ def test_the_monotone_gradient_is_for_parametrisations():
     assert {"a_std", "eta_3_std"} <= set(found.to_pandas("estimates").columns)
 
 
-def test_a_step_too_large_for_newtons_method_is_taken_in_parts():
-    """At samples, from a = 5: a whole step would go where S has no value."""
+@pytest.mark.parametrize("bent", ["sqrt(a)", "atan(5*(a - 2))"])
+def test_a_step_too_large_for_newtons_method_is_taken_in_parts(bent):
+    """At samples, from a = 5: a whole step would go where S has no value, or never arrive."""
     found = run(
-        regression={**TEXT, "S": ["sqrt(a)", "b", "1", "2"], "unknowns": {"a": 0.2, "b": 0.5}},
+        regression={**TEXT, "S": [bent, "b", "1", "2"], "unknowns": {"a": 0.2, "b": 0.5}},
         estimator={**MONOTONE, "gamma": 1e14, "initial": {"a": 5, "b": 0.5}},
         observer={"sample_time": 0.5, "hold": "zoh"}, time={"horizon": 5},
     )

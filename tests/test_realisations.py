@@ -18,7 +18,7 @@ from gpebo_cli.estimators import build
 from gpebo_cli.experiment.noise import measure, noise_levels
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -78,6 +78,29 @@ def test_estimators_carry_realisations_through(settings):
     )
     assert ours.shape == expected.shape == (len(build(settings).cases), 3, 3, 3)
     assert ours == pytest.approx(expected, abs=1e-7)
+
+
+@pytest.mark.parametrize("settings", ESTIMATORS, ids=lambda s: "-".join(map(str, s.values())))
+def test_estimates_do_not_depend_on_when_the_clock_began(settings):
+    """Neither what is required, nor what errors of Y do."""
+    own, begin = regression(three, ETA, 6.0, 40, lambda t: 0.1 * np.sin(2 * t)), -512.0
+    edges = own.mesh.edges + begin
+    mesh = Mesh(edges, own.mesh.rule)
+    other = replace(
+        own, Y=Trajectory(mesh, own.Y.values), psi=Trajectory(mesh, own.psi.values)
+    )
+    t, found = np.array([0.0, 1.7, 2.55, 6.0]), []
+    for about, at in ((own, t), (other, t + begin)):
+        made = build(settings).estimate(about, at)
+        numbers = [made.parameters(slice(None)), *made.requirement.evidence.values()]
+        if made.delta(at) is not None:
+            numbers.append(made.delta(at))
+        if hasattr(build(settings), "errors"):
+            for errors in build(settings).errors(about):
+                numbers += [x + np.zeros((4, 1, 1)) for x in errors(at[1:2], at[1:2])]
+        found.append(numbers)
+    for one, same in zip(*found, strict=True):
+        np.testing.assert_allclose(same, one, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("estimator", ["gradient", "least_squares", "ls_drem"])

@@ -20,7 +20,13 @@ import gpebo_cli
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
-from gpebo_cli.estimators._recursive import KreisselmeierFilter, ScalarLaw, quotient_of, spectrum
+from gpebo_cli.estimators._recursive import (
+    KreisselmeierFilter,
+    ScalarLaw,
+    mix_sampled,
+    quotient_of,
+    spectrum,
+)
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
@@ -269,7 +275,11 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     f0, alpha, beta = 0.3, 2.0, 0.4
     settings = {"name": "least_squares", "f0": f0, "alpha": alpha, "beta": beta, "initial": 0.7}
     recursion = estimators.build(settings).recursive(["a", "b", "c"])
-    estimate = recursion.update(block).parameters[0, -1]
+    made = recursion.update(block)
+    estimate = made.parameters[0, -1]
+    assert recursion.requirement.holds
+    assert made.met[-1]
+    assert not made.met[0]  # two rows for three parameters
     age = block.t[-1] - block.t
     weight = np.exp(-beta * age)
     rows = block.weighted() * np.sqrt(alpha * weight)[:, None, None]
@@ -329,9 +339,11 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     """Two rows alone, then three: from the sample on which the third wakes, all start anew."""
     block, rates = regression(K=40, r=3, hold="linear"), np.array([0.5, 1.0, 2.0])
     block.rows[:, 2] = 0.0
+    block.rows[:, 0, 1] = 0.0  # one of its numbers is not the row
     two = replace(block, rows=block.rows[:, :2])
     own, alone = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
     np.testing.assert_array_equal(own.update(block), alone.update(two))
+    assert (alone.seen(two)[1] == np.eye(2)[[0, 1, 0]]).all()
     block.rows[20:] = regression(K=20, r=3, hold="linear").rows
     part = replace(block, t=block.t[19:], steps=block.steps[19:], rows=block.rows[19:])
     own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
@@ -406,6 +418,33 @@ def test_the_gradient_law_is_solved_exactly_over_each_sample(gain, hold):
     assert recursion.requirement.holds == (left <= 0.01)
 
 
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_new_regressor_is_rotated_over_each_sample(hold):
+    """By φ' = κΔ²(π/2 − φ) in all, about −𝐘/Δ as it is there or in the middle."""
+    block = regression(K=25, hold=hold)
+    mixed = mix_sampled(KreisselmeierFilter(np.ones(3)).update(block), None)
+    weight, eta = mixed.delta[:, 0] ** 2, mixed.quotient[:, 0]
+    kappa = 1.0 / float(block.steps @ weight)
+    made = estimators.build({"name": "exciting", "kappa": kappa, "lambda": 1.0}).recursive("abc")
+    found = made._mixing(block)  # Φ_21 and e_2/Φ_21
+    phi, c = 0.0, np.zeros((2, 3))
+    for k, step in enumerate(block.steps):
+        if not mixed.usable[k]:
+            continue
+        both = hold == "linear" and k and mixed.usable[k - 1]
+        energy = step * (0.5 * (weight[k] + weight[k - 1] * (k > 0)) if hold == "linear"
+                         else weight[k])
+        towards = 0.5 * (eta[k] + eta[k - 1]) if both else eta[k]
+        delta = (0.5 * np.pi - phi) * -np.expm1(-kappa * energy)
+        phi += delta
+        turn = np.array([[np.cos(delta), -np.sin(delta)], [np.sin(delta), np.cos(delta)]])
+        about = np.stack([towards, 0.0 * towards])
+        c = turn @ (c + about) - about
+        assert found.delta[k, 0] == pytest.approx(np.sin(phi), abs=1e-12)
+        np.testing.assert_allclose(found.quotient[k, 0] * np.sin(phi), c[1], atol=1e-10)
+    assert 0.1 < phi < 1.57
+
+
 @pytest.mark.parametrize("name", ["mre", "gradient"])
 def test_errors_never_grow_beside_a_regressor_that_does(name):
     """Of ψ that grows to e^80 few digits are known in most directions: there nothing is learned."""
@@ -450,6 +489,20 @@ def test_means_at_samples_are_sums_over_the_samples(perturbed):
             eta = goal + np.exp(-gain * delta**2 * block.steps[k]) * (eta - goal)
         expected.append(eta)
     np.testing.assert_allclose(made.parameters[0], expected, atol=1e-9)
+
+
+def test_what_is_rounding_of_mixing_is_not_used():
+    """Neither of rows that are one but for rounding, nor where Δ is too small for a number."""
+    one = np.ones((2, 2)) + np.diag([0.0, 3e-16])
+    extended = np.array([
+        np.column_stack([omega, omega @ [2.0, -1.0]])
+        for omega in (np.eye(2), one, 1e-170 * np.eye(2), -np.eye(2))
+    ])
+    found = mix_sampled(extended, None)
+    np.testing.assert_array_equal(found.usable[:, 0], [True, False, False, True])
+    np.testing.assert_array_equal(
+        found.quotient[:, 0], [[2.0, -1.0], [0.0, 0.0], [0.0, 0.0], [2.0, -1.0]]
+    )
 
 
 MONOTONE = {

@@ -78,6 +78,22 @@ def test_the_mean_of_white_samples():
     np.testing.assert_allclose(of_x[:, 0], 2.0 * expected, rtol=1e-9)
 
 
+def test_where_rounding_decides_at_the_start_the_first_row_alone_says_nothing():
+    """Though C is a number before the second row comes."""
+    def mean(t, inside):
+        made = summing(0.0)(t, inside)
+        return made._replace(C=np.where(inside[:, None, None] < 0.01, np.nan, made.C))
+
+    t = np.array([0.005, 0.05, 0.1, 0.15, 1.0])
+    of_eta, of_x = deviations(
+        directly, mean, np.ones((5, 1, 1)), np.linspace(0, 1, 5), Rows(np.arange(10) * 0.1),
+        np.ones(1), t,
+    )
+    np.testing.assert_array_equal(of_eta, of_x)
+    assert np.isnan(of_eta[:3]).all()
+    np.testing.assert_allclose(of_eta[3:, 0], np.sqrt([0.0125, 0.1]) / [0.15, 1.0], rtol=1e-6)
+
+
 @pytest.mark.parametrize("rate", [1e-2, 1.0, 10.0, 1e2, 1e3, 1e4, 1e6, 1e10])
 def test_an_estimate_that_follows_samples_at_once_does_so_between_them(rate):
     """s' = λ(e − s): of s at a sample e^{−λt} is left, and the rest is its new error."""
@@ -112,8 +128,8 @@ def test_the_level_of_segments_is_their_mean_square_over_time(monkeypatch):
     """σ = 1 for one second and σ = 2 for three; of a segment of which nobody knows it, nothing."""
     monkeypatch.setattr(of_runs, "noise_level", lambda _, own, *__: own.level)
     ends = [(2.0, 3.0, 1.0), (3.0, 6.0, 2.0), (6.0, 9.0, np.nan)]
-    segments = [SimpleNamespace(mesh=SimpleNamespace(edges=each[:2]), level=each[2])
-                for each in ends]
+    segments = [SimpleNamespace(mesh=SimpleNamespace(edges=(start, 0.5 + start, end)), level=level)
+                for start, end, level in ends]
     found = of_runs._level(None, SimpleNamespace(segments=segments), None, np.ones(1), None)
     assert found == pytest.approx(np.sqrt((1.0 + 3.0 * 4.0) / 4.0))
 

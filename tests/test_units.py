@@ -289,3 +289,59 @@ def test_a_plant_without_derivatives_has_observers(settings):
         "B": [[1], [0]], "F": [[0], ["cos(t)"]], "C": [[1, 0]], "initial_state": [0, -1],
     }, time={"horizon": 20, "samples": 51}, **settings)
     assert result.estimates["th"].ravel()[-1] == pytest.approx(2.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("given", [
+    {"estimator": {"name": "ls_drem"}},
+    {"estimator": {"name": "least_squares"}, "remedy": "reset", "reset_times": [1.5]},
+    {"estimator": {"name": "drem", "gamma": 1e4}, "remedy": "current_coordinates"},
+    {"estimator": {"name": "least_squares", "f0": None}, "remedy": "current_coordinates"},
+    {"estimator": {"name": "least_squares", "f0": None}, "sample_time": 0.125},
+    {"estimator": {"name": "least_squares"}, "recorded": True}, {"name": "kalman_bucy"},
+], ids=str)
+def test_nothing_depends_on_when_the_clock_began(given):
+    """Of a plant with constant matrices: estimates, deviations, evidence, and times since then."""
+    more = {key: value for key, value in given.items() if key not in {"estimator", "recorded"}}
+    noise = {"name": "gaussian", "outputs": 0.05, "sample_time": 0.25}
+
+    def found(start):
+        plant = {
+            "name": "two", "states": ["x", "z"], "inputs": {"u": f"sin(3*(t - {start}))"},
+            "unknowns": {"a": 2.0}, "outputs": ["y"], "E": [[1, 0], [0, 0]],
+            "A": [[-0.5, 1], [1, 1]], "B": [[1], [0]], "F": [[1], [0]], "C": [[1, 0]],
+            "initial_state": [1, -1],
+        }
+        time = {"start": start, "horizon": 4.0, "samples": 33}
+        own = {"name": "gpebo", **more}
+        if "reset_times" in own:
+            own["reset_times"] = [start + t for t in own["reset_times"]]
+        settings = {"time": time, "noise": noise}
+        if "recorded" in given:
+            made = run(plant, observer="none", time=time)
+            y = made["y"] + 0.05 * np.cos(40.0 * np.arange(33) ** 2)
+            y[20] += 9.0
+            settings = {"data": {"t": made.t, "u": made["u"], "y": y}}
+        estimator = given.get("estimator", "gradient")
+        details = run(plant, estimator=estimator, observer=own, **settings).details
+        of, seen = details.estimation, details.excitation
+        times = [seen.t_c, seen.determined, *details.estimable.values()]
+        evidence = [
+            value - start * (key in {"t_c", "at", "window_start"})
+            for a in (*details.assumptions, of.requirement) for key, value in a.evidence.items()
+            if isinstance(value, float)
+        ]
+        fit = details.fit
+        ours = [] if fit is None else [
+            fit.residual, fit.size, fit.least, fit.correlation, fit.lag, fit.outputs,
+            [t - start for *_, t in fit.far],
+        ]
+        return [
+            of.t - start, of.parameters, of.states, *details.metrics.columns.values(),
+            *(x for x in (of.parameters_std, of.states_std, of.delta) if x is not None),
+            *of.doubts[0].values(), evidence, *ours,
+            [np.nan if each is None else each - start for each in times], seen.pe_level,
+            seen.gram_eigenvalues, seen.level, seen.condition,
+        ]
+
+    for one, other in zip(found(0.0), found(-8.0), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-8)

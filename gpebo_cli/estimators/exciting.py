@@ -82,12 +82,12 @@ class Exciting(WindowedEstimator):
 
         def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             values = found(t, inside)[:, 1]
-            return values[:, 0], values[:, 1:], np.abs(values[:, 0])
+            return values[:, 0], values[:, 1:], values[:, 0]
 
         new, right = found.values[:, :, 1, 0], found.values[:, :, 1, 1:]
-        usable = np.abs(new) > _KNOWN
+        usable = new > _KNOWN
         quotient = filled(right / np.where(usable, new, 1.0)[..., None], usable)
-        law = scalar_path(found.mesh, signals, new, np.abs(new), quotient, t, path.floor)
+        law = scalar_path(found.mesh, signals, new, new, quotient, t, path.floor)
         (end,) = inner.at_end()
         end = replace(end, turned=found.final)
         law = resolved(law, inner.gains)

@@ -196,7 +196,7 @@ class PowerEstimates(MixedEstimates):
         coupling, gamma = delta[:, :, None] * integral, gamma[:, None]
         w, before = np.sign(rest) * np.abs(rest) ** self.alpha, np.full_like(rest, np.inf)
         ratio, root = self.beta / self.alpha, 1.0 / self.alpha
-        scale, still = _scale(path, eta), np.where(delta, 0.0, 1.0)
+        scale = _scale(path, eta)
         for _ in range(_ITERATIONS):
             size = np.abs(w)
             speed, slope = gamma * w, gamma
@@ -209,9 +209,9 @@ class PowerEstimates(MixedEstimates):
                 break
             J = coupling * slope[:, None]
             diagonal = np.einsum("nii->ni", J)  # a view
-            diagonal += np.maximum(root * size ** (root - 1.0), still)
+            diagonal += root * size ** (root - 1.0)
             # Where nothing is left of Δ and r nothing moves.
-            diagonal += np.abs(J).max(axis=2) <= _NOTHING
+            diagonal += J.max(axis=2) <= _NOTHING
             F = np.copysign(size**root, w) + delta * moved - rest
             w, before = w - np.linalg.solve(J, F[..., None])[..., 0], moved
         return np.concatenate([eta[:, None], eta[:, None] + moved], axis=1), change

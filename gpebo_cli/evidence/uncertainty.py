@@ -202,11 +202,12 @@ class _Chain:
             weights = self._groups.weights(mesh.points[new, 1:], group[new, None], self._until)
             B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
             made = _maps(mesh, mesh.steps[new], joint.A, B)
-            C = joint.C if len(joint.C) > 1 else joint.C.repeat(made[:, :, 0, 0].size, axis=0)
+            (count, stages), C = made.shape[:2], joint.C
+            C = C if len(C) > 1 else C.repeat(count * stages, axis=0)
             if not cuts:
                 maps, common, varies = made, C[-1], np.empty(mesh.size, dtype=bool)
             maps[new] = made
-            varies[new] = (common != C).reshape(len(made), -1).any(axis=1)
+            varies[new] = (common != C).any(axis=(1, 2)).reshape(count, stages).any(axis=1)
             left = mesh.edges[:-1]
             factors, end = _factors(
                 maps[:, -1], np.diff(group, prepend=self._group) > 0, np.isin(left, self._anew),
@@ -245,7 +246,7 @@ class _Chain:
         B = np.zeros((len(points), zeta + own, signals))
         B[:, :zeta] = o.B
         B[:, zeta:] = e.B @ o.D[:, :rows]
-        shape = (-1, mesh.rule.stages, zeta + own)
+        shape = (len(points) // mesh.rule.stages, mesh.rule.stages, zeta + own)
         system = ErrorSystem(A.reshape(*shape, zeta + own), B.reshape(*shape, signals), e.C, e.D)
         return system, o
 

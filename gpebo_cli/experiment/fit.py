@@ -131,7 +131,7 @@ def _explained(
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.
-    apart = 2.0 * (recording.last - recording.first) / max(recording.rows - 1, 1)
+    apart = 2.0 * (recording.last - recording.first) / (recording.rows - 1)
     step = float(t[-1] - t[0]) / (len(t) - 1)
     stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]
