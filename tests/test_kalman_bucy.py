@@ -372,6 +372,18 @@ def test_a_wrong_plant_does_not_explain_a_recording(rate, told):
     assert told in found.verdict
 
 
+def test_what_may_drift_explains_no_data():
+    """Least squares of constants say nothing of a filter that takes one of them to wander."""
+    t = np.linspace(0.0, 5.0, 201)
+    plant = one_state(unknowns={"leak": 1.0}, F=[[-1]], initial_state=[0])
+    data = {"t": t, "y": -t + 0.01 * np.random.default_rng(0).standard_normal(201)}
+    told = [
+        api_run(plant, data=data, observer={"name": "kalman_bucy", "process": process}).verdict
+        for process in (0.0, {"leak": 0.1})
+    ]
+    assert ["explain the data" in verdict for verdict in told] == [True, False]
+
+
 @pytest.mark.parametrize("hold", ["linear", "zoh"])
 def test_the_deviation_of_a_long_recording_is_that_of_its_uneven_rows(hold):
     """Of constant levels: each is a sum of rows, and outputs of one row each tell its weights."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
-from gpebo_cli.regression import dynamics
+from gpebo_cli.regression import dynamics, linear
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
@@ -312,6 +313,13 @@ def with_a_reset_to_the_same():
     return plain, type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
 
 
+def test_a_long_regression_with_resets_or_many_seeds_is_taken_as_a_whole(monkeypatch):
+    monkeypatch.setattr(linear, "_WINDOW", 16)
+    plain, cut = with_a_reset_to_the_same()
+    seeds = replace(plain, Y=Trajectory(plain.mesh, plain.Y.values[..., None] * np.ones(2)))
+    assert [len(list(each.windows())) for each in (plain, cut, seeds)] == [5, 1, 1]
+
+
 def test_windows_of_excitation_run_through_resets():
     """Behind each reset to η₊ = Tη a level is that of the plain regression's T⁻ᵀGT⁻¹."""
     plain = make_regression(three, ETA)
@@ -398,6 +406,10 @@ def test_filters_in_current_coordinates_hold_the_state():
     zeta = observation.truth(t, np.broadcast_to(system.theta, (201, 1)), signals.states)
     values = both(t)
     residual = np.einsum("mij,mj->mi", values[..., :-1], zeta) - values[..., -1]
+    gram = regression.gram(t[1:])
+    np.testing.assert_allclose(  # rounding is a share of what there is, however little that is
+        regression.rounding_of(1e-9 * gram), 1e-9 * regression.rounding_of(gram), rtol=1e-12
+    )
     size = np.linalg.norm(values[..., :-1], axis=(1, 2)) * np.linalg.norm(zeta, axis=1)
     assert (np.abs(residual).max(axis=1) <= 1e-10 * size.max()).all()
     expected = (*system.unknowns, "w_x1", "w_x2", "w_x3")

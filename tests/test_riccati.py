@@ -272,6 +272,20 @@ def test_a_covariance_that_becomes_indefinite_is_refused():
         case.filtered(np.zeros(2), np.eye(2), 3.0)
 
 
+def test_window_gramians_are_resolved_in_any_units_of_the_outputs():
+    """x' = 0 seen with W = ε(1 + cos 20t), in elements of one and a half of its periods."""
+    small, window = 1e-9, 2.0
+
+    def model(t: Array, inside: Array) -> tuple[Array, Array]:
+        return np.zeros((1, 1, 1)), small * (1.0 + np.cos(20.0 * t))[:, None, None]
+
+    mesh = initial_mesh(0.0, 20.0, [], 40, radau_rule(5))
+    found = window_gramians(model, 1, mesh, tol=1e-8, max_elements=5000)
+    t = found.starts
+    expected = window + (np.sin(20.0 * (t + window)) - np.sin(20.0 * t)) / 20.0
+    np.testing.assert_allclose(found.gramians[:, 0, 0] / small, expected, rtol=1e-8)
+
+
 @pytest.mark.parametrize("stages", [12, 3])
 def test_window_gramians_of_a_constant_system(stages):
     """M = ∫₀ᵀ e^{Aᵀs} cᵀc e^{As} ds, by the block exponential, for windows that start anywhere."""
