@@ -180,6 +180,7 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
 
 def test_the_weakest_singular_value_is_found_among_bounds_of_it():
     H = np.random.default_rng(0).normal(size=(40, 5, 3))
+    H *= np.array([1.0, 1e-3, 1e-3])
     H[:, :, 0] *= np.linspace(1.0, 3.0, 40)[:, None]
     smallest = 1.0 / np.linalg.norm(H, 2, axis=(1, 2))
     value, place = weakest(1.0 / np.linalg.norm(H, axis=(1, 2)), H)

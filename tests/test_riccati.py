@@ -281,9 +281,10 @@ def test_window_gramians_are_resolved_in_any_units_of_the_outputs():
 
     mesh = initial_mesh(0.0, 20.0, [], 40, radau_rule(5))
     found = window_gramians(model, 1, mesh, tol=1e-8, max_elements=5000)
-    t = found.starts
+    whole = np.isin(found.starts, mesh.edges)  # there, windows end at edges
+    t, M = found.starts[whole], found.gramians[whole, 0, 0]
     expected = window + (np.sin(20.0 * (t + window)) - np.sin(20.0 * t)) / 20.0
-    np.testing.assert_allclose(found.gramians[:, 0, 0] / small, expected, rtol=1e-8)
+    np.testing.assert_allclose(M / small, expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("stages", [12, 3])

@@ -195,8 +195,10 @@ def test_it_does_not_matter_how_samples_are_grouped():
     able = ("fct", "power", "exciting", "gradient", "mre", "instrumental", "annihilator")
     for name in ("ls_drem", "least_squares", "drem", *able):
         settings = Settings(estimator={"name": name})
-        whole = Online(settings, system, "linear", t[0], np.append(u[0], y[0])).feed(t, u, y)
-        parts = Online(settings, system, "linear", t[0], np.append(u[0], y[0]))
+        at_once, parts = (
+            Online(settings, system, "linear", t[0], np.append(u[0], y[0])) for _ in range(2)
+        )
+        whole = at_once.feed(t, u, y)
         cuts = [0, 1, 2, 9, 40, 60]
         made = [
             parts.feed(t[a:b], u[a:b], y[a:b]) for a, b in pairwise(cuts)
@@ -204,6 +206,9 @@ def test_it_does_not_matter_how_samples_are_grouped():
         for field in ("parameters", "states"):
             joined = np.concatenate([getattr(part, field) for part in made], axis=1)
             np.testing.assert_allclose(joined, getattr(whole, field), rtol=1e-8, atol=1e-9)
+        for field in ("growth", "growth_rate"):
+            assert getattr(parts, field) == pytest.approx(getattr(at_once, field), rel=1e-6)
+        assert parts.assumptions == at_once.assumptions
 
 
 def test_every_case_is_what_it_is_alone():
