@@ -170,6 +170,29 @@ def test_remedies_are_the_same_in_any_units(remedy, name):
     assert away.max(initial=0.0) <= 1e-8
 
 
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating", "mixed"])
+@pytest.mark.parametrize("observer", [
+    {}, {"remedy": "output_injection"}, {"remedy": "reset", "reset_interval": 3.5},
+    {"sample_time": 0.1}, {"sample_time": 0.1, "hold": "linear"},
+], ids=lambda o: "-".join(map(str, o.values())))
+def test_deviations_are_the_same_in_any_units(name, observer):
+    """Noise of an output is in its unit, and the time of a sample in that of time."""
+    def in_time(by):
+        scaled = {k: v * float(by.time) for k, v in observer.items() if isinstance(v, float)}
+        return {"name": "gpebo", **observer, **scaled}
+
+    one, other, units = both(
+        name, True, seed=[5, 1], estimator={"name": "least_squares", "f0": None}, observer=in_time,
+        noise=lambda by: {"name": "gaussian", "outputs": np.abs(0.01 * by.outputs).tolist(),
+                          "sample_time": 0.1 * float(by.time)},
+    )
+    q = one.system.q
+    for part, of in (("parameters_std", units.unknowns), ("states_std", units.states)):
+        a, b = (getattr(run.estimation, part)[0, 50:] for run in (one, other))
+        a, b = (a[:, :q], b[:, :q]) if part == "parameters_std" else (a, b)
+        np.testing.assert_allclose(b / np.abs(of), a, rtol=1e-5)
+
+
 def test_what_filters_leave_of_a_column_is_rounding():
     """No output sees x1 here: squares of it were 3e-16 of the others, and counted as excitation."""
     result = run(random_system(0)[0], time={"horizon": HORIZON, "samples": 101},
