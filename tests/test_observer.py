@@ -14,7 +14,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
-from gpebo_cli.observers.reduced.split import axes_frame
+from gpebo_cli.observers.reduced.split import axes_frame, constant_split
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -276,6 +276,26 @@ def test_what_no_output_sees_is_not_excited_by_rounding(g):
     assert not found.excitation.is_ie
     unknown = {name for name, since in found.estimable.items() if since is None}
     assert unknown == {"a", "b", "e0_2"}
+
+
+@pytest.mark.parametrize("units", [np.ones(4), 10.0 ** np.array([3, -4, 0, 5])])
+def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
+    rng, t = np.random.default_rng(3), np.linspace(0.0, 2.0, 5)
+    E = rng.normal(size=(4, 2)) @ np.diag([1.0, 1e-7]) @ rng.normal(size=(2, 4))
+    moving = (1.0 + 0.5 * np.sin(t))[:, None, None] * E
+    found = constant_split(moving / units, tuple("abcd"), units, 1e-10)
+    assert found.rank == 2
+    assert found.frame is not None
+    P = found.projector[0] * units / units[:, None]
+    np.testing.assert_allclose(P @ P, P, atol=1e-12)
+    np.testing.assert_allclose(P, P.T, atol=1e-12)
+    np.testing.assert_allclose(E @ P, E, atol=1e-12)
+    np.testing.assert_allclose(found.pinv @ (moving / units) - found.dual @ found.projector, 0.0,
+                               atol=1e-6 * np.abs(found.dual).max())
+    turn = np.eye(4) + 1e-12 * t[:, None, None] * rng.normal(size=(4, 4))
+    assert constant_split(moving @ turn / units, tuple("abcd"), units, 1e-10) is None
+    small = constant_split(moving / units, tuple("abcd"), units, 1e-6)
+    assert small is None or small.rank == 1
 
 
 def test_axes_of_what_is_differentiated_are_exact():
