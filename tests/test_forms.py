@@ -15,9 +15,11 @@ from test_observer import ROTATING
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, gpebo, observe
+from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -427,6 +429,20 @@ def test_hidden_constraints_hold_on_the_solution():
     left += np.einsum("nij,nj->ni", hidden.driving, v) + hidden.unknowns @ system.theta
     assert np.abs(left).max() < 1e-10
     assert (np.linalg.matrix_rank(hidden.states) == form.structure.a).all()
+
+
+@pytest.mark.parametrize("plant", CONSTRAINED, ids=lambda p: p["name"])
+def test_rounding_of_hidden_constraints_is_bounded_whatever_its_signs(plant):
+    system, t = plant_from_mapping(plant), np.linspace(0.0, 5.0, 7)
+    inputs = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
+    given = EquationForm.given(system, inputs)
+    form = strangeness_free(given, t, t, None, max_mu=6, rank_tol=1e-10)
+    o, hidden = observer_matrices(form, t, t, 1e-10), form.equations(t, t, None).hidden
+    K = (o.elimination @ transpose(o.range))[:, :, -system.n - system.r : -system.r]
+    signs = np.sign(np.random.default_rng(0).normal(size=(50, 1, system.n, system.n)))
+    wrong = np.abs(K @ (signs * hidden.rounding)).max(axis=(0, 1))
+    assert (wrong <= (1.0 + 1e-9) * o.rounding + 1e-300).all()
+    assert (o.rounding <= 100.0 * system.n * hidden.rounding.max()).all()
 
 
 def test_derivatives_of_a_signal_are_those_of_its_polynomials():

@@ -216,19 +216,26 @@ def test_window_is_exciting_but_not_uniformly_observable():
 def test_uniform_observability_is_measured_by_P0():
     """Of states that stand still the Gramian is ∫CᵀV⁻¹C: one known at the start counts as others.
 
-    λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations.
+    λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations. Here
+    it is that of a, which is seen less and less.
     """
     result = api_run(
         {"name": "still", "states": ["a", "b", "c"], "outputs": ["y1", "y2", "y3"],
          "E": np.eye(3).tolist(), "A": np.zeros((3, 3)).tolist(),
-         "C": np.diag([1, 2, 1]).tolist(), "initial_state": [1, 2, 3]},
+         "C": [["exp(-t/5)", 0, 0], [0, 2, 0], [0, 0, 1]], "initial_state": [1, 2, 3]},
         observer={"name": "kalman_bucy", "P0": {"w_a": 4.0, "w_b": 9.0, "w_c": 0.0}},
         noise={"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}, time={"horizon": 5.0},
     )
-    found = result.details.estimation.requirement
-    unit = found.evidence["window"] / (0.02**2 * 0.1)
-    assert found.evidence["lambda_min"] == pytest.approx(4.0 * unit, rel=1e-6)
+    found, unit = result.details.estimation.requirement, 1.0 / (0.02**2 * 0.1)
+    first, last = (2.5 * (np.exp(-0.4 * t) - np.exp(-0.4 * t - 0.2)) for t in (0.0, 4.5))
+    longer = {"largest_lambda_min": 4.0 * unit * first, "needed": 1e-8 * 9.0 * 2.0**2 * 0.5 * unit}
+    for key, value in longer.items():  # of windows that end at an edge
+        assert 1.0 <= found.evidence[key] / value < 1.25
+    assert found.evidence == pytest.approx({
+        **found.evidence, "window": 0.5, "window_start": 4.5, "lambda_min": 4.0 * unit * last,
+    }, rel=1e-6)
     assert found.holds
+    assert f"falls to {4.0 * unit * last:.3g} of P0⁻¹ (from t = 4.5 s on; evi" in found.text
 
 
 def test_a_wandering_unknown_is_followed():
