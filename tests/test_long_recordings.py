@@ -82,6 +82,24 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
 
 
+@pytest.mark.parametrize("hold", ["linear", "zoh"])
+def test_where_states_have_bounds_the_map_is_kept_at_all_rows(hold):
+    system = plant_from_mapping(STEP)
+    signals, wanted = rough(system, hold), np.linspace(0.0, 4.0, 23)
+    whole, few = (
+        build({"name": "gpebo", "bounds": {"states": {"x1": [-9.0, 9.0]}}}).observe(
+            system, each, SolverSettings()
+        ).state_map for each in (signals, replace(signals, wanted=wanted))
+    )
+    assert set(signals.mesh.edges) | set(wanted) <= set(few.offset.t)
+    inside = np.minimum(few.offset.t + 1e-9, 4.0)
+    for part in ("offset", "gain"):
+        expected = getattr(whole, part)(few.offset.t, inside)
+        np.testing.assert_allclose(
+            getattr(few, part)(few.offset.t), expected, atol=1e-8 * np.abs(expected).max()
+        )
+
+
 @pytest.mark.parametrize(
     ("rate", "size", "interpolated"), [(1.0, 2, True), (60.0, 2, False), (1.0, 40, False)]
 )

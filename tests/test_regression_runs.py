@@ -107,11 +107,20 @@ def test_at_samples_operators_are_those_of_the_held_signals(hold, order):
     assert np.log2(error[1] / error[2]) == pytest.approx(order, abs=0.35)
 
 
+def test_one_unknown_is_found_at_samples():
+    given = {**SINE, "unknowns": {"a": 2.0}, "psi": [["s"]]}
+    found = run(
+        regression=given, estimator={"name": "least_squares", "f0": 1e-12}, time={"horizon": 2},
+        observer={"sample_time": 0.1}, noise={"name": "gaussian", "outputs": 1e-6},
+    )
+    assert found.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-5)
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_samples_may_come_in_any_pieces(hold):
     text = regression_from_mapping({**OPERATORS, "signals": {"s": None}})
     t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, 80))
-    s = np.sin(3 * t)[:, None]
+    s = (np.exp(-t) * np.sin(3 * t))[:, None]
     Y = np.cos(t)[:, None]
     _, whole = text.advance(hold, None, t, s, Y)
     state, rows = None, []

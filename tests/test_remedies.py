@@ -639,6 +639,29 @@ def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):
         run(GROWING, 1.0, remedy="output_injection")
 
 
+@np.errstate(all="ignore")
+def test_filters_forget_twice_as_fast_as_what_has_decayed_fastest_so_far():
+    """In levels of which 96 are a decade; decays, once a hundredth of their time has passed."""
+    mesh = initial_mesh(0.0, 4.0, [], 40, radau_rule(9))
+    t = mesh.points
+    rows = np.zeros((*t.shape, 2, 3))
+    rows[..., 0, 0], rows[..., 1, 1] = 0.5 * np.cos(t), np.sin(1.5 * t) * (1.0 + t)
+    moves = Dynamics(Trajectory(mesh, rows), np.ones(2))
+    at = np.linspace(0.01, 3.99, 200)
+    decay = -np.minimum(0.5 * np.cos(at), np.sin(1.5 * at) * (1.0 + at))
+    fastest = np.maximum.accumulate(np.where(decay * at > 0.01, decay, 0.0))
+    times, levels = moves.forgetting
+    found = 0.5 * levels[np.searchsorted(times, at)]
+    step, some = 10.0 ** (1.0 / 96.0), fastest > 0.0
+    assert not found[~some].any()
+    assert (found[some] >= fastest[some]).all()
+    before = np.maximum.accumulate(np.append(fastest[1:], fastest[-1]))  # between two times
+    assert (found[some] <= step * before[some]).all()
+    rises = np.maximum(np.maximum(0.5 * np.cos(t), np.sin(1.5 * t) * (1.0 + t)), 0.0)
+    expected = Trajectory(mesh, rises).integral().final
+    assert moves.growth == pytest.approx(expected, rel=1e-12)
+
+
 def test_filters_that_forget_fast_take_more_stages_than_a_recording_has():
     """Its elements are not cut for e^{−1000 t}."""
     mesh = initial_mesh(0.0, 0.2, [], 100, radau_rule(3))
