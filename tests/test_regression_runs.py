@@ -123,12 +123,14 @@ def test_samples_may_come_in_any_pieces(hold):
     s = (np.exp(-t) * np.sin(3 * t))[:, None]
     Y = np.cos(t)[:, None]
     _, whole = text.advance(hold, None, t, s, Y)
-    state, rows = None, []
+    state = None
     for part in (slice(0, 1), slice(1, 2), slice(2, 30), slice(30, 31), slice(31, 80)):
         state, piece = text.advance(hold, state, t[part], s[part], Y[part])
-        rows.append(piece.rows[1:])
-        np.testing.assert_allclose(piece.scale, whole.scale[part], rtol=1e-12)
-    np.testing.assert_allclose(np.concatenate(rows), whole.rows[1:], rtol=1e-12, atol=1e-14)
+        rows = whole.rows[part.start : part.stop + 1]
+        np.testing.assert_allclose(piece.rows, rows, rtol=1e-12, atol=1e-14)
+        for name in ("scale", "steps", "t"):
+            expected = getattr(whole, name)[part]
+            np.testing.assert_allclose(getattr(piece, name), expected, rtol=1e-12)
 
 
 def test_a_stream_is_the_file_at_its_samples(tmp_path):

@@ -16,10 +16,10 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 T = np.linspace(0.0, 10.0, 201)
 
 
-def on_mesh(mapping, tol=1e-12):
+def on_mesh(mapping, tol=1e-12, start=0.0):
     model = regression_from_mapping({"name": "r", **mapping})
     solver = SolverSettings(tol=tol)
-    signals = signals_of_time(model.system, model, TimeSettings(horizon=10.0), solver)
+    signals = signals_of_time(model.system, model, TimeSettings(start, 10.0), solver)
     regression, error = model.on(signals[0], None, tol, 100_000)
     assert error <= 1e-10
     return regression
@@ -81,6 +81,21 @@ def test_a_delay_moves_jumps_exactly():
 def test_what_signals_switch_is_as_exact_as_what_time_does(along, of_time):
     found, expected = values(along, u="sin(t)"), values(of_time, u="sin(t)")  # each on its own mesh
     np.testing.assert_allclose(found, expected, atol=1e-10)
+
+
+@pytest.mark.parametrize("start", [-7.0, 3.0])
+def test_it_does_not_matter_when_a_run_starts(start):
+    texts = ["integral(sign(u - 0.3))", "lp(sign(lp(u, 2)), 5)", "delay(sign(u), 1.25)*u"]
+    rest = {"unknowns": {"a": 1.0}, "Y": texts, "psi": [["hp(u, 3)"], ["integral(u)"], [1]]}
+    found, expected = (
+        on_mesh({**rest, "signals": {"u": f"sin(t - ({at}))"}}, start=at) for at in (start, 0.0)
+    )
+    assert found.mesh.size == expected.mesh.size
+    inside = T[1:] - 1e-3
+    for part in ("Y", "psi"):
+        np.testing.assert_allclose(
+            getattr(found, part)(inside + start), getattr(expected, part)(inside), atol=1e-10
+        )
 
 
 def test_delays_that_make_too_many_corners_are_refused():
