@@ -215,6 +215,17 @@ def test_a_kernel_that_rotates(remedy, estimator):
     assert relative_error(result)[-1] < 1e-9
 
 
+@pytest.mark.parametrize("remedy", ["none", "reset", "output_injection", "current_coordinates"])
+def test_a_kernel_that_rotates_leaves_the_papers_regression_its_outputs(remedy):
+    """Its last r rows are about the outputs; in current coordinates there are further rows."""
+    plant = {**ROTATING, "outputs": list("klmn"), "C": np.eye(4).tolist()}
+    result = run(plant, 5.0, regression="paper", remedy=remedy)
+    assert result.excitation.is_ie
+    assert relative_error(result)[-1] < 1e-6
+    rows = 8 if remedy == "current_coordinates" else 4
+    assert result.regression.psi.shape[1] == rows
+
+
 @pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
 def test_the_regression_holds_in_every_segment(name):
     """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
