@@ -348,10 +348,12 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     noise = {"noise": {"name": "gaussian", "outputs": sigma}} if level == "given" else {}
     result = api_run(
         plant, observer={"name": "kalman_bucy", "P0": 1e4}, data=pd.DataFrame({"t": t, "y": y}),
-        time={"samples": 11}, **noise,
+        time={"samples": 89}, **noise,
     )
     # By information, 1/σ²h per second: the pause has as much as one sample.
     of_mean, estimation = sigma / np.sqrt(len(h)), result.details.estimation
+    first = estimation.states_std[0, 1, 0]  # after five samples
+    assert first == pytest.approx(sigma / np.sqrt(5), rel=1e-3 if level == "given" else 0.08)
     assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.08)
     assert abs(result["x_hat"][0, -1] - 2.0) < 3 * of_mean
     assert ("taken from the residual, 0.3" in result.verdict) == (level != "given")
