@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from gpebo_cli import run
 from gpebo_cli.evidence.excitation import assess, persistent, sampled_window_level
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
@@ -278,3 +279,19 @@ def test_the_last_line_says_how_much_of_a_recording_is_explained():
     power = [(left[k:] * left[: len(left) - k]).sum() for k in range(21)]
     np.testing.assert_allclose(fit.correlation, np.array(power[1:]) / power[0], atol=1e-6)
     assert (fit.lag, fit.band) == pytest.approx((0.1, 1.96 / np.sqrt(201.0)))
+
+
+def test_integrals_early_in_an_element_are_no_more_wrong_than_is_said():
+    """∫ψᵀψ of ψ = (1, t) beside its closed form, from 1e-15 of the first element on."""
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([np.ones_like(t), t], axis=-1)[..., None, :],
+        lambda t: t[..., None], ["a", "b"], 8.0, 4,
+    )
+    t = np.concatenate([np.geomspace(2e-15, 1.9, 40), 2.0 + np.geomspace(1e-9, 1.9, 9)])
+    gram, rounding = made.gram_with_rounding(t)
+    exact = np.stack([t, t**3 / 3.0], axis=1)
+    wrong = np.abs(np.einsum("mjj->mj", gram[..., :2]) - exact)
+    assert (wrong <= rounding + 1e-15 * exact).all()
+    end = np.floor(t / 2.0 + 1.0) * 2.0  # of its element
+    size = np.stack([end, end**3 / 3.0], axis=1) * (t % 2.0 / 2.0)[:, None]
+    assert (rounding <= 1e-11 * size).all()

@@ -249,6 +249,21 @@ def test_starting_value_of_the_extension_is_free():
     np.testing.assert_allclose(truth, [0, -1, -2], atol=1e-12)
 
 
+@pytest.mark.parametrize(("xi_a0", "starts"), [
+    (None, [0.0, 1.0, 5.0]), ({"b": 2.0}, [0.0, 2.0, 5.0]), ({"a": 0.3, "c": 4}, [0.3, 1.0, 4.0]),
+    ([0.1, 0.2, 0.3], [0.1, 0.2, 0.3]),
+])
+def test_known_initial_values_are_those_said_or_the_plants(xi_a0, starts):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "c"], "outputs": ["y"], "E": np.eye(3).tolist(),
+        "A": np.diag([-1, -2, -3]).tolist(), "C": [[1, 1, 1]], "initial_state": [7, 1, 5],
+    })
+    _, found = observed(plant, 1.0, unknown_initial=["a"], xi_a0=xi_a0)
+    assert found.regression.parameters == ("e0_a",)
+    np.testing.assert_allclose(found.state_map.offset(np.zeros(1))[0], starts, atol=1e-12)
+    np.testing.assert_allclose(found.state_map.gain(np.zeros(1))[0, :, 0], [-1, 0, 0], atol=1e-12)
+
+
 @pytest.mark.parametrize("observer", ["gpebo", "kalman_bucy"])
 @pytest.mark.parametrize("speed", [1.0, 7.3])
 def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed, observer):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -247,6 +248,25 @@ def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
     eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
     assert eta[0, 0] == 0.7
     np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
+
+
+@pytest.mark.parametrize("plant", [one_state(A=[[1]]), one_state(
+    states=["a", "b"], E=[[1, 0], [0, 1]], A=[[0.6, 2], [0, 0.3]], C=[[1, 0]], initial_state=[1, 1],
+)], ids=["one", "two"])
+def test_resets_come_at_the_last_edge_before_the_extension_exceeds_a_hundred(plant):
+    """‖Φ‖₂ of Φ = e^{At}, from one reset to the next."""
+    system = plant_from_mapping(plant)
+    signals, found = along(system, 15.0, remedy="reset")
+    times, edges = [0.0], signals.inputs.mesh.edges
+    times += [reset.time for reset in found.regression.resets]
+    assert len(times) > 2
+    for before, time in pairwise(times):
+        after = edges[np.searchsorted(edges, time + 1e-9)]
+        there, too_late = (
+            np.linalg.norm(expm(np.array(plant["A"]) * (t - before)), 2) for t in (time, after)
+        )
+        assert there <= 100.0 * (1.0 + 1e-5)
+        assert too_late > 100.0 * (1.0 - 1e-5)
 
 
 def test_growth_is_that_of_the_longest_segment():
