@@ -118,6 +118,10 @@ def test_evidence_is_the_same_in_any_units(name, decades):
                     for run in (one, other))
     assert known == again
     assert [x.holds for x in one.assumptions] == [x.holds for x in other.assumptions]
+    of_a, of_b = (x.evidence for run in (one, other) for x in run.assumptions
+                  if x.name == "Growth of Φ")
+    assert of_b["largest_entry"] == pytest.approx(of_a["largest_entry"], rel=2e-3)
+    assert of_b["rate"] * T == pytest.approx(of_a["rate"], rel=1e-6, abs=1e-9)
     # The observer's units are those of the plant to a power of ten.
     x, y = (
         [x.evidence.get("smallest_singular_value") for x in run.assumptions
