@@ -295,3 +295,13 @@ def test_integrals_early_in_an_element_are_no_more_wrong_than_is_said():
     end = np.floor(t / 2.0 + 1.0) * 2.0  # of its element
     size = np.stack([end, end**3 / 3.0], axis=1) * (t % 2.0 / 2.0)[:, None]
     assert (rounding <= 1e-11 * size).all()
+
+
+def test_terms_are_the_largest_so_far_and_at_an_edge_those_before_it():
+    made = LinearRegression.from_functions(
+        lambda t: t[..., None, None], lambda t: t[..., None], ["a"], 4.0, 4
+    )
+    made = replace(made, scale=np.array([[1.0], [2.0], [5.0], [7.0]]))
+    assert made.terms(np.array([0.0, 0.5, 1.0, 1.5, 3.0, 3.5, 4.0]))[:, 0].tolist() == [
+        1.0, 1.0, 1.0, 2.0, 5.0, 7.0, 7.0,
+    ]

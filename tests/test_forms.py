@@ -347,14 +347,16 @@ def test_check_says_which_form_and_why():
 
 @pytest.mark.parametrize(("of_all", "long", "forms"), [
     ("growing", 10_000, ["auto", "strangeness_free"]), ("growing", 1, ["auto"]),
-    ("circuit", 10_000, ["auto"]),
+    ("circuit", 10_000, ["auto"]), ("index 1", 10_000, ["auto"]),
+    ("index 2", 10_000, ["auto", "strangeness_free"]),
 ])
 def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     of_all, long, forms, monkeypatch
 ):
     """What its rounding leaves is not resolved with all elements; that costs minutes.
 
-    Unasked a long run is not observed twice, nor one that as given determines everything.
+    Unasked a long run is not observed twice, nor one that as given determines everything, nor one
+    of index 1, whose constraints are all there: of c nothing is seen.
     """
     monkeypatch.setattr(gpebo, "_LONG", long)
     given, asked = gpebo.reduced_system, []
@@ -369,7 +371,14 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
         "E": [[1, 0], [0, 0]], "A": [[3, 1], [1, 1]], "B": [[1], [1]], "C": [[0, 1]],
         "initial_state": [1, -1],
     }
-    run(growing if of_all == "growing" else of_all, time={"horizon": 10})
+    hidden = {
+        "name": "hidden", "states": ["a", "b", "c"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": np.diag([1, 0, 1]).tolist(), "B": [[0], [1e-9], [0]], "C": [[0, 1, 0]],
+        "A": [[-1, 1, 0], [-1e-9, 1e-9 if of_all == "index 1" else 0, 0], [0, 0, -1]],
+        "initial_state": [0, 0, 1],
+    }
+    plants = {"growing": growing, "index 1": hidden, "index 2": hidden}
+    run(plants.get(of_all, of_all), time={"horizon": 10})
     assert [form for form, _ in asked] == forms
     assert all(elements < 0.1 * SOLVER.max_elements for _, elements in asked)
 

@@ -25,6 +25,7 @@ from gpebo_cli.observers._base import SignalNoise
 from gpebo_cli.observers.reduced import condensed, extension
 from gpebo_cli.observers.reduced import system as reduced
 from gpebo_cli.recordings.hold import held, recording_mesh
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression import linear
 from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Lasting, Unmixed
@@ -80,6 +81,28 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(
     residual = whole.regression.Y(at) - whole.regression.psi(at) @ eta
     rms = np.sqrt((residual**2).sum(axis=1).mean())
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
+
+
+def test_a_long_recording_is_thinned_to_lines_between_wanted_times_and_where_matrices_jump():
+    system, solver = plant_from_mapping(STEP), SolverSettings()
+    signals = rough(system, "linear", rows=300)
+    wanted = signals.mesh.edges[[20, 100, 201]]
+    few = condensed.thinned(system, replace(signals, wanted=wanted), solver)
+    assert few.mesh.edges.tolist() == sorted([0.0, *wanted, 1.2345, 4.0])
+    both = few.at(few.mesh.edges)
+    np.testing.assert_allclose(both, signals.at(few.mesh.edges), atol=1e-12)
+    middle = few.at(0.5 * (few.mesh.edges[1:] + few.mesh.edges[:-1]))
+    np.testing.assert_allclose(middle, 0.5 * (both[1:] + both[:-1]), atol=1e-12)
+    count = signals.mesh.size // 8
+    derivatives = InputDerivatives.of_plant(system, np.ones(1, dtype=bool))
+    battery = shipped("battery")
+    for plant, changes in (
+        (system, {"wanted": None}), (system, {"wanted": np.linspace(0.0, 4.0, count + 1)}),
+        (system, {"wanted": wanted, "derivatives": derivatives}), (battery, {"wanted": wanted}),
+    ):
+        assert condensed.thinned(plant, replace(signals, **changes), solver) is None
+    most = replace(signals, wanted=np.linspace(0.0, 4.0, count))
+    assert condensed.thinned(system, most, solver) is not None
 
 
 @pytest.mark.parametrize("hold", ["linear", "zoh"])

@@ -81,6 +81,8 @@ def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
     assert observation.of_constants is observation.state_map
     assert replace(observation, estimator=estimators.build({"name": "drem"})).of_constants is None
     assert replace(observation, names=("a",)).of_constants is None
+    for observer in ({"remedy": "reset", "reset_interval": 5.0}, {"remedy": "current_coordinates"}):
+        assert run(shipped("descriptor"), **observer)[1].of_constants is None
 
 
 def test_circuit_regressor_matches_the_reference_up_to_sign():
