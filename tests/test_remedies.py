@@ -344,6 +344,21 @@ def with_a_reset_to_the_same():
     return plain, type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
 
 
+@pytest.mark.parametrize("p", [3, 17])
+@pytest.mark.parametrize("factor", [None, 1.0, 2.0])
+def test_what_is_known_at_the_end_is_that_of_every_time_there(p, factor):
+    """Of many parameters it is made without that of all times, unless there are resets."""
+    made = make_regression(
+        lambda t: np.cos(np.asarray(t)[..., None] * np.arange(1.0, p + 1.0)), np.ones(p)
+    )
+    if factor is not None:
+        at = float(made.mesh.edges[30])
+        made = replace(made, resets=(Reset(at, factor * np.eye(p), np.zeros(p), 0.0),))
+    final = made.gram_final
+    np.testing.assert_allclose(final, made.gram.final, atol=1e-10)
+    np.testing.assert_allclose(made.gram_at(np.array([10.0]))[0], final, atol=1e-10)
+
+
 def test_a_long_regression_with_resets_or_many_seeds_is_taken_as_a_whole(monkeypatch):
     monkeypatch.setattr(linear, "_WINDOW", 16)
     plain, cut = with_a_reset_to_the_same()
