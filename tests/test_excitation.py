@@ -305,3 +305,12 @@ def test_terms_are_the_largest_so_far_and_at_an_edge_those_before_it():
     assert made.terms(np.array([0.0, 0.5, 1.0, 1.5, 3.0, 3.5, 4.0]))[:, 0].tolist() == [
         1.0, 1.0, 1.0, 2.0, 5.0, 7.0, 7.0,
     ]
+
+
+def test_least_squares_leave_a_parameter_that_nothing_depends_on_at_zero():
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([np.cos(t), 0.0 * t], axis=-1)[..., None, :],
+        lambda t: 3.0 * np.cos(t)[..., None], ["a", "b"], 4.0, 4,
+    )
+    np.testing.assert_allclose(made.least_squares(), [3.0, 0.0], atol=1e-12)
+    assert made.misfit(np.array([1.0, 7.0])) == pytest.approx(4.0 * (2.0 + np.sin(8.0) / 4.0))

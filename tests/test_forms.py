@@ -192,6 +192,11 @@ def test_constrained_plants_from_one_output(plant, start):
     found, error, of_states = observed(plant, xi_a0=xi_a0)
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
+    regression = found.regression
+    sizes = np.abs(regression.psi.values[:, [0, -1]]).max(axis=(1, 2))
+    scale = np.broadcast_to(regression.scale, sizes.shape)
+    assert (scale >= (1.0 - 1e-9) * np.maximum.accumulate(sizes, axis=0)).all()  # of its terms
+    assert (np.diff(scale, axis=0) >= 0.0).all()
     assert "on the strangeness-free form, for as given Assumption 1" in found.note
     evidence = {a.name: a.evidence for a in found.assumptions}["Assumption 1"]
     assert evidence["form"] == "strangeness_free"
@@ -553,6 +558,7 @@ def test_a_plant_without_derivatives():
     for chosen in ({}, {"remedy": "reset"}, {"remedy": "output_injection"}):
         found, error, of_states = observed(plant, 5.0, **chosen)
         assert found.regression.parameters == ("a",)
+        assert found.growth_rate == 0.0
         assert np.abs(error).max() < 1e-12
         assert of_states < 1e-12
     noisy = run(

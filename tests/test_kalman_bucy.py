@@ -356,7 +356,8 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     assert first == pytest.approx(sigma / np.sqrt(5), rel=1e-3 if level == "given" else 0.08)
     assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.08)
     assert abs(result["x_hat"][0, -1] - 2.0) < 3 * of_mean
-    assert ("taken from the residual, 0.3" in result.verdict) == (level != "given")
+    told = "taken from the residual, 0.3" if level != "given" else "noise of the outputs"
+    assert (told in result.verdict) == (level != "given")
 
 
 @pytest.mark.parametrize(("rate", "told"), [

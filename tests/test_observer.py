@@ -187,6 +187,7 @@ def test_the_weakest_singular_value_is_found_among_bounds_of_it():
     smallest = 1.0 / np.linalg.norm(H, 2, axis=(1, 2))
     value, place = weakest(1.0 / np.linalg.norm(H, axis=(1, 2)), H)
     assert (value, place) == (pytest.approx(smallest.min()), smallest.argmin())
+    assert weakest(np.full(3, np.inf), H[:3, :, :0]) == (np.inf, 0)  # nothing is eliminated
 
 
 def test_rotating_kernel_with_unknown_parameter():

@@ -128,6 +128,8 @@ def test_samples_may_come_in_any_pieces(hold):
         state, piece = text.advance(hold, state, t[part], s[part], Y[part])
         rows = whole.rows[part.start : part.stop + 1]
         np.testing.assert_allclose(piece.rows, rows, rtol=1e-12, atol=1e-14)
+        largest = np.maximum.accumulate(np.abs(whole.rows[1:, :, :-1]).max(axis=1))
+        np.testing.assert_array_equal(whole.scale, largest)
         for name in ("scale", "steps", "t"):
             expected = getattr(whole, name)[part]
             np.testing.assert_allclose(getattr(piece, name), expected, rtol=1e-12)
@@ -160,6 +162,14 @@ def test_deviations_of_known_noise_of_y_are_those_of_many_seeds(psi):
     np.testing.assert_allclose(found.noise.deviation[0], stated, rtol=0.12)
     at_samples = run(**given, noise={**noise, "seeds": 1}, observer={"sample_time": 0.05}).details
     np.testing.assert_allclose(at_samples.estimation.parameters_std[0, -1], stated, rtol=0.02)
+
+
+@pytest.mark.parametrize(("inputs", "stated"), [({}, True), ({"v": 0.1}, False)])
+def test_noise_of_a_signal_in_psi_has_no_deviation_to_state(inputs, stated):
+    given = {**SINE, "signals": {"s": "sin(t)", "v": "cos(3*t)"}, "psi": [["s", "v"]]}
+    found = run(regression=given, estimator="least_squares", time={"horizon": 5},
+                noise={"name": "gaussian", "outputs": 0.1, "inputs": inputs})
+    assert (found.details.estimation.parameters_std is not None) == stated
 
 
 def test_arrays_by_name_and_what_can_be_checked():

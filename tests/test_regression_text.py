@@ -128,6 +128,7 @@ def test_estimators_find_the_parameters(name):
         "signals": {"u": "1", "y": "4*(1 - exp(-t/2))"},
         "Y": ["hp(y, 3)"], "psi": [["lp(y, 3)", "lp(u, 3)"]],
     })
+    assert np.max(regression.scale) == np.abs(regression.psi.values).max()
     estimator = estimators.build({"name": name})
     found = estimators.estimate(estimator, regression, T).parameters(slice(0, 1))
     np.testing.assert_allclose(found[0, -1], [-0.5, 2.0], atol=1e-5)  # f₀ is in it

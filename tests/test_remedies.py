@@ -364,6 +364,9 @@ def test_a_long_regression_with_resets_or_many_seeds_is_taken_as_a_whole(monkeyp
     plain, cut = with_a_reset_to_the_same()
     seeds = replace(plain, Y=Trajectory(plain.mesh, plain.Y.values[..., None] * np.ones(2)))
     assert [len(list(each.windows())) for each in (plain, cut, seeds)] == [5, 1, 1]
+    edges = plain.mesh.edges
+    whole = replace(plain).gram(edges)
+    np.testing.assert_allclose(plain.gram_at(edges), whole, atol=1e-10)
 
 
 def test_windows_of_excitation_run_through_resets():

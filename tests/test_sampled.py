@@ -716,5 +716,8 @@ def test_what_is_delayed_lies_between_samples_as_the_hold_has_it(hold, between):
     first = np.array([0.0]), np.array([[0.0]])
     found, past = delayed(first, np.array([1.0]), np.array([[3.0]]), 0.75, hold)
     assert found == pytest.approx(np.array([[between]]))
-    again, _ = delayed(past, np.array([2.0]), np.array([[6.0]]), 0.75, hold)
+    again, past = delayed(past, np.array([2.0]), np.array([[6.0]]), 0.75, hold)
     assert again == pytest.approx(np.array([[3.0 * 1.25 if hold == "linear" else 3.0]]))
+    for t in np.arange(3.0, 50.0):  # what is kept is no longer than the delay and a step
+        _, past = delayed(past, np.array([t]), np.array([[3.0 * t]]), 0.75, hold)
+        assert past[0].tolist() == [t - 1.0, t]
