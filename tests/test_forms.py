@@ -177,6 +177,14 @@ def test_assumption_1_may_fail_at_a_time_that_is_met_when_elements_are_cut(when)
     assert max(np.abs(error).max(), of_states) < 1e-9
 
 
+def assert_terms(regression):
+    """The scale is that of the terms of ψ so far, which are no smaller than ψ."""
+    sizes = np.abs(regression.psi.values[:, [0, -1]]).max(axis=(1, 2))
+    scale = np.broadcast_to(regression.scale, sizes.shape)
+    assert (scale >= (1.0 - 1e-9) * np.maximum.accumulate(sizes, axis=0)).all()
+    assert (np.diff(scale, axis=0) >= 0.0).all()
+
+
 CONSTRAINED = [CAPACITORS, PENDULUM, TANKS, FOUR_BAR, CRANE, LC_LOOP]
 
 
@@ -192,11 +200,7 @@ def test_constrained_plants_from_one_output(plant, start):
     found, error, of_states = observed(plant, xi_a0=xi_a0)
     assert np.abs(error).max() < 1e-9
     assert of_states < 1e-9
-    regression = found.regression
-    sizes = np.abs(regression.psi.values[:, [0, -1]]).max(axis=(1, 2))
-    scale = np.broadcast_to(regression.scale, sizes.shape)
-    assert (scale >= (1.0 - 1e-9) * np.maximum.accumulate(sizes, axis=0)).all()  # of its terms
-    assert (np.diff(scale, axis=0) >= 0.0).all()
+    assert_terms(found.regression)
     assert "on the strangeness-free form, for as given Assumption 1" in found.note
     evidence = {a.name: a.evidence for a in found.assumptions}["Assumption 1"]
     assert evidence["form"] == "strangeness_free"
@@ -417,9 +421,10 @@ def test_feedthrough_bias_of_a_sensor_and_a_known_term():
         "initial_state": [1, 0],
     }
     for form in ("given", "strangeness_free"):
-        _, error, of_states = observed(plant, form=form)
+        found, error, of_states = observed(plant, form=form)
         assert np.abs(error).max() < 1e-10
         assert of_states < 1e-10
+        assert_terms(found.regression)
 
 
 def test_an_unknown_of_the_outputs_alone_in_an_index_3_plant():
@@ -725,6 +730,20 @@ def test_nothing_is_given_up_for_rounding_where_assumption_1_fails(share):
     assert np.isnan(left[2])
     (of_E,) = (a.evidence for a in found.assumptions if a.name == "Rank of E")
     assert of_E["rank"] == 2  # with the part that is given up
+
+
+def test_what_a_failure_of_assumption_1_touches_at_some_times_only_is_lost():
+    """Of a and b one combination is told, at t = 0 that is a, and at π/2 it is b."""
+    plant = {
+        "name": "turning", "states": ["w", "a", "b", "c"], "inputs": {"u": "sin(3*t)", "v": "2*t"},
+        "outputs": ["y"], "E": np.diag([1, 0, 0, 1]).tolist(), "C": [[0, 0, 0, 1]],
+        "A": [[-1, "-sin(t)", "cos(t)", 0], [0, "cos(t)", "sin(t)", 0], [1, 0, 0, 0],
+              [0, 0, 0, -1]],
+        "B": [[0, 0], [0, -1], [-1, 0], [0, 0]], "initial_state": [0, 0, 3, 1],
+    }
+    found = run(plant, time={"horizon": 3.0, "samples": 31}, estimator="ls_drem",
+                observer={"name": "gpebo", "form": "given"}).details
+    assert [found.estimable[name] is None for name in "wabc"] == [False, True, True, False]
 
 
 def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():
