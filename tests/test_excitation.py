@@ -301,6 +301,7 @@ def test_terms_are_the_largest_so_far_and_at_an_edge_those_before_it():
     made = LinearRegression.from_functions(
         lambda t: t[..., None, None], lambda t: t[..., None], ["a"], 4.0, 4
     )
+    assert made.scale == 4.0  # the largest entry of ψ
     made = replace(made, scale=np.array([[1.0], [2.0], [5.0], [7.0]]))
     assert made.terms(np.array([0.0, 0.5, 1.0, 1.5, 3.0, 3.5, 4.0]))[:, 0].tolist() == [
         1.0, 1.0, 1.0, 2.0, 5.0, 7.0, 7.0,

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from plants import BOOST, LORENZ, shipped
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
+from units import Units, in_units
 
 from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
@@ -608,7 +609,8 @@ def test_what_grows_away_from_hidden_constraints_stays_on_them(rate, turn):
     assert estimation.parameters[0, -1, 0] == pytest.approx(0.7, rel=1e-9)
 
 
-def test_rounding_of_hidden_constraints_is_no_signal():
+@pytest.mark.parametrize("unit", [1.0, 1e7])
+def test_rounding_of_hidden_constraints_is_no_signal(unit):
     """E = P diag(I, N) Q of index 2, all turning, a mode of 1e4: x4 is told by constraints alone.
 
     What e₀ has part in it is rounding, which no mesh resolves.
@@ -635,13 +637,15 @@ def test_rounding_of_hidden_constraints_is_no_signal():
         "name": "stiff", "states": ["x1", "x2", "x3", "x4"], "inputs": {"u": "sin(t)"},
         "outputs": ["y1", "y2", "y3", "y4"], "E": product(P, product(N, Q)), "A": A,
         "B": product(P, [["1e4"], ["1"], ["1"], ["0"]]), "C": np.eye(4).tolist(),
-        "initial_state": [0.5, -1, 0, 0],
+        "initial_state": dict(zip(["x1", "x2", "x3", "x4"], [0.5, -1, 0, 0], strict=True)),
     }
+    if unit != 1.0:
+        plant = in_units(plant, Units(unit * np.ones(4), *map(np.ones, (0, 1, 4, 4)), 1.0))
     found = run(
         plant, observer={"name": "gpebo", "form": "strangeness_free"},
         estimator={"name": "least_squares", "f0": 1e-14}, time={"horizon": 2, "samples": 51},
     ).details
-    error = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1]).max()
+    error = np.abs(found.estimation.states[0, -1] - found.simulation.states[-1]).max() / unit
     assert error < found.regression.error_estimate < 1e-6
 
 

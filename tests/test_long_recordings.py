@@ -83,6 +83,18 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
 
 
+@pytest.mark.parametrize("name", ["gpebo", "kalman_bucy"])
+def test_the_error_of_what_all_rows_add_is_in_the_estimate(name, monkeypatch):
+    driven, system = condensed.driven, plant_from_mapping(STEP)
+    noise = SignalNoise(np.zeros(1), np.full(2, 0.1), 0.01)
+    signals = replace(
+        rough(system, "linear", rows=300), noise=noise, wanted=np.linspace(0.0, 4.0, 5)
+    )
+    monkeypatch.setattr(condensed, "driven", lambda *a, **k: (*driven(*a, **k)[:2], 0.125))
+    found = build({"name": name}).observe(system, signals, SolverSettings())
+    assert found.error_estimate == 0.125
+
+
 def test_a_long_recording_is_thinned_to_lines_between_wanted_times_and_where_matrices_jump():
     system, solver = plant_from_mapping(STEP), SolverSettings()
     signals = rough(system, "linear", rows=300)

@@ -157,6 +157,19 @@ def test_mistakes(change, message):
         regression_from_mapping({**GOOD, **change})
 
 
+@pytest.mark.parametrize(("Y", "psi", "measured"), [
+    (["y", "z"], [["u"], [1]], True), (["y", "u"], [[1], [1]], False),
+    (["y", "y"], [[1], [1]], False), (["y", "2*z"], [[1], [1]], False),
+    (["y", "z"], [["y"], [1]], False),
+])
+def test_recorded_signals_that_stand_in_Y_alone_are_outputs(Y, psi, measured):
+    given = {"name": "r", "unknowns": {"a": 1}, "signals": {"y": None, "z": None, "u": "sin(t)"}}
+    found = regression_from_mapping({**given, "Y": Y, "psi": psi})
+    assert found.system.outputs == (tuple(Y) if measured else ())
+    assert found.system.inputs == (("u",) if measured else ("y", "z", "u"))
+    assert (found.Y is None) == measured
+
+
 def test_an_expression_without_a_value_is_named_with_its_time():
     with pytest.raises(ConfigError, match="1/u"):
         on_mesh({**GOOD, "psi": [["1/u"]]})

@@ -459,6 +459,11 @@ def test_filters_in_current_coordinates_hold_the_state():
     np.testing.assert_allclose(  # rounding is a share of what there is, however little that is
         regression.rounding_of(1e-9 * gram), 1e-9 * regression.rounding_of(gram), rtol=1e-12
     )
+    units = np.array([1.0, 10.0, 0.1, 5.0])
+    other = replace(regression, dynamics=replace(regression.dynamics, units=units))
+    largest = (np.einsum("mjj->mj", gram[..., :4]) * units**2).max(axis=1)
+    expected = 1e-12 * np.outer(largest, units**-2)
+    np.testing.assert_allclose(other.rounding_of(gram), expected, rtol=1e-12)
     size = np.linalg.norm(values[..., :-1], axis=(1, 2)) * np.linalg.norm(zeta, axis=1)
     assert (np.abs(residual).max(axis=1) <= 1e-10 * size.max()).all()
     expected = (*system.unknowns, "w_x1", "w_x2", "w_x3")
