@@ -10,6 +10,8 @@ from processes import refused
 from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
 from gpebo_cli.settings import SolverSettings, TimeSettings
 
@@ -96,6 +98,22 @@ def test_it_does_not_matter_when_a_run_starts(start):
         np.testing.assert_allclose(
             getattr(found, part)(inside + start), getattr(expected, part)(inside), atol=1e-10
         )
+
+
+@pytest.mark.parametrize("step", [1.0, -1.0])
+def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
+    """At an edge of its elements, up or down, while another signal is smooth."""
+    model = regression_from_mapping({
+        "name": "r", "unknowns": {"a": 1.0}, "signals": {"u": None, "v": None},
+        "Y": ["integral(delay(u, 0.35))", "v"], "psi": [[1], [1]],
+    })
+    mesh = initial_mesh(0.0, 10.0, [], 10, radau_rule(9))
+    both = np.stack([np.where(mesh.inside > 3.0, step, 0.0), np.sin(mesh.points)], axis=2)
+    found, _ = model.on(Trajectory(mesh, both), None, 1e-12, 1_000)
+    assert 3.35 in found.mesh.edges
+    assert found.mesh.size < 40
+    expected = np.stack([step * np.maximum(T - 3.35, 0.0), np.sin(T)], axis=1)
+    np.testing.assert_allclose(found.Y(T), expected, atol=1e-10)
 
 
 def test_delays_that_make_too_many_corners_are_refused():
