@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -165,6 +165,20 @@ def test_result_does_not_depend_on_the_restarts():
     (P, x), (Q, y) = coarse.at(t), fine.at(t)
     assert relative(P, Q) < 1e-9
     assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
+
+
+def test_the_error_estimate_is_of_the_estimate_where_the_covariance_rests():
+    """P = 1 solves −2P + 3 − P² = 0; ζ̂' = −2ζ̂ + sin 40t is resolved roughly."""
+    one = np.ones((1, 1))
+    case = constant(-one, one, 3.0 * one, one, 0.0 * one)
+    case = replace(case, z=lambda t: np.array([np.sin(40.0 * t)]))
+    rough = case.filtered(np.zeros(1), one, 10.0, tol=1e-2)
+    t = np.unique(rough.mesh.points)
+    P, x = rough.at(t)
+    np.testing.assert_allclose(P, 1.0, rtol=1e-12)
+    exact = (2.0 * np.sin(40.0 * t) - 40.0 * np.cos(40.0 * t) + 40.0 * np.exp(-2.0 * t)) / 1604.0
+    wrong = np.abs(x[:, 0, 0] - exact).max() / np.abs(exact).max()
+    assert 0.1 < rough.error_estimate / wrong < 10.0
 
 
 def test_many_elements_take_few_stages_and_lose_nothing():
