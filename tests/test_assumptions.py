@@ -16,7 +16,7 @@ from gpebo_cli.experiment.assumptions import examine, warnings
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers._base import largest_entry
-from gpebo_cli.settings import Settings
+from gpebo_cli.settings import Settings, TimeSettings
 
 ROOT = Path(__file__).parent.parent
 
@@ -182,3 +182,23 @@ def test_what_is_zero_but_for_rounding_does_not_jump():
     simulated = run_experiment(Settings({}, observer={"name": "none"}), system).simulation
     assert simulated.jumps == ()
     assert 0.0 < np.abs(simulated.states[:, 3]).max() < 1e-9
+
+
+@pytest.mark.parametrize("seen", [0.0, 1.0])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_state_that_no_equation_sees_is_none_in_other_coordinates_either(seed, seen):
+    """E = P diag(I, 0) Q, and of the last state in Q x outputs see ``seen``, equations nothing."""
+    rng = np.random.default_rng(seed)
+    A, C = rng.normal(size=(4, 4)), rng.normal(size=(2, 4))
+    A[3, 3], C[:, 3] = 0.0, seen
+    P, Q = rng.normal(size=(2, 4, 4))
+    plant = {
+        "name": "mixed", "states": ["x1", "x2", "x3", "x4"], "outputs": ["y1", "y2"],
+        "E": (P @ np.diag([1.0, 1.0, 1.0, 0.0]) @ Q).tolist(), "A": (P @ A @ Q).tolist(),
+        "C": (C @ Q).tolist(), "initial_state": [1, 0, 0, 0],
+    }
+    settings = Settings(
+        estimator={}, observer={"name": "gpebo", "form": "given"}, time=TimeSettings(horizon=0.1)
+    )
+    names = {a.name: a for a in examine(settings, plant_from_mapping(plant, "mixed")).assumptions}
+    assert names["Assumption 1"].holds == bool(seen)

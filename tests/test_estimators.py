@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
-from scipy.integrate import quad_vec, trapezoid
+from scipy.integrate import cumulative_trapezoid, quad_vec, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
@@ -741,6 +741,29 @@ def test_estimates_do_not_depend_on_the_elements_of_the_regression():
         for elements in (20, 320)
     )
     np.testing.assert_allclose(few, many, atol=1e-7)
+
+
+def test_a_large_gain_acts_while_the_regressor_is_still_small():
+    """Ω' = −λ(Ω − ψ²) with ψ = t³ grows by many orders of magnitude within one element.
+
+    On that η̂ = η (1 − e^{−γ∫Δ²}) of drem, and φ(κ∫Δ²) by which exciting turns.
+    """
+    slow = regression(lambda t: np.asarray(t)[..., None] ** 3, np.array([3.0]), elements=10)
+    fine, rate, gain = np.linspace(0.0, 1.0, 100_001), 0.1, 1e12
+    series = [rate / 7.0]  # of ∫ λ e^{−λ(t − s)} s⁶ ds
+    for k in range(8, 20):
+        series.append(-series[-1] * rate / k)
+    delta = fine**7 * np.polynomial.Polynomial(series)(fine)
+    energy = np.concatenate([[0.0], cumulative_trapezoid(delta**2, fine)])[2500::2500]
+    share = -np.expm1(-gain * energy)
+    assert share[5] < 0.01
+    assert share[20] > 0.9
+    t, settings = fine[2500::2500], {"lambda": rate}
+    np.testing.assert_allclose(
+        run("drem", slow, t, gamma=gain, **settings)[0, :, 0], 3.0 * share, atol=1e-6
+    )
+    turned = estimate("exciting", slow, t, kappa=gain, **settings).delta(t)[0]
+    np.testing.assert_allclose(turned, np.sin(0.5 * np.pi * share), atol=1e-6)
 
 
 def test_elements_are_cut_where_a_filter_is_faster_than_they_are():

@@ -765,3 +765,24 @@ def test_a_failure_of_assumption_1_where_the_kernel_of_E_turns_keeps_nothing():
         run(plant, time=short, observer={"name": "gpebo", "form": "given"})
     found = run(plant, time=short, estimator="least_squares").estimates["th"].ravel()[-1]
     assert found == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_state_that_is_zero_because_terms_cancel_is_no_signal():
+    """x3 is zero at all times; what rounding makes of it needs no elements."""
+    plant = {
+        "name": "cancelling", "states": [f"x{i + 1}" for i in range(6)], "outputs": ["y"],
+        "inputs": {"u": "cos(0.7*t) + 0.5"}, "initial_state": [1, 0.3, 0, -3, -6, -5],
+        "E": [[1, -2, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, -1, 0, 0, 0], [2, 0, 1, 3, 0, -1],
+              [2, 0, 0, 3, 0, -1], [-2, 0, 0, -3, 0, 1]],
+        "A": [["-2.56 - 0.64/(1 + t)", "3.96 - 0.3/(1 + t)", 0, 0, 0, 0],
+              ["0.22 + 0.27/(1 + t)", "0.11/(1 + t) - 2.21", 0, 0, 0, 0],
+              [0, 0, 1, -1, 0, 0], [-2, 0, 0, 1, 1, 0], [-2, 0, 0, 0, 1, 0], [0, 0, 0, -2, -1, 1]],
+        "B": [[1], [2], [-2], [2], [0], [-1]],
+        "C": [[1, 0, -1, -1, 1, 0]],
+    }
+    found = run(
+        plant, observer={"name": "gpebo", "form": "strangeness_free"}, estimator="least_squares",
+        solver={"max_elements": 100}, time={"horizon": 3, "samples": 21},
+    )
+    assert np.abs(found.errors["x3"]).max() < 1e-12
+    assert np.abs(found.errors["x1"][0, -1]) < 1e-6

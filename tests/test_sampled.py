@@ -17,6 +17,7 @@ from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 from test_remedies import MIXED
 
+import gpebo_cli
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, ModelError, SolverError
 from gpebo_cli.estimators import InformationRoot
@@ -441,6 +442,23 @@ def test_the_gradient_law_is_solved_exactly_over_each_sample(gain, hold):
     left = recursion.requirement.evidence["left_of_the_initial_error"]
     assert scaled <= (left + 1e-9) * np.linalg.norm(eta / np.sqrt(Gamma))
     assert recursion.requirement.holds == (left <= 0.01)
+
+
+@pytest.mark.parametrize("name", ["mre", "gradient"])
+def test_errors_never_grow_beside_a_regressor_that_does(name):
+    """Of ψ that grows to e^80 few digits are known in most directions: there nothing is learned."""
+    growing = {
+        "name": "growing", "states": ["x1", "x2", "x3"], "outputs": ["y"],
+        "E": np.eye(3).tolist(), "A": [[4, 1, 0], ["sin(t)", 3, 1], [0, 0, 1]],
+        "C": [[1, 0, 0]], "initial_state": [1, -1, 2],
+    }
+    found = gpebo_cli.run(
+        growing, estimator=name, observer={"name": "gpebo", "sample_time": 0.05},
+        time={"horizon": 20, "samples": 101},
+    ).details.estimation
+    assert 0.0 < found.requirement.evidence["left_of_the_initial_error"] < 1.0
+    error = np.linalg.norm(found.parameters - found.true_parameters, axis=-1)
+    assert error.max() < 1.01 * error[0, 0]
 
 
 @pytest.mark.parametrize("perturbed", [None, ["b"]])

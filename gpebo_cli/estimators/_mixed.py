@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, Mixed, ScalarLaw, mix_sampled
-from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, scalar_law
+from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, resolved, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
@@ -287,8 +287,9 @@ def mixed_estimates(
     at_end: Callable[[], tuple[ExtensionState, ...]], known: Known, condition: str = "Δ not in L2",
 ) -> MixedEstimates:
     """The estimates with the gains γ of some settings, of mixed regressions."""
-    names = regression.parameters
+    names, gains = regression.parameters, settings.gains("gamma", regression.parameters)
+    groups = tuple(resolved(path, gains) for path in groups)
     return MixedEstimates(
-        groups, settings.start(names), settings.gains("gamma", names), condition, at_end,
+        groups, settings.start(names), gains, condition, at_end,
         realisations=regression.realisations, known=known, units=regression.units,
     )

@@ -19,7 +19,7 @@ from gpebo_cli import kernels
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, reciprocals
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, legendre_tail, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 
@@ -101,7 +101,8 @@ class ScalarPath:
     mixed: Array  # (K, s + 1) Δ
     digits: Array  # (K, s + 1) σ_min/σ_max of Ω, or less by a factor of up to p
     quotient: Array  # (K, s + 1, p) η̄, usable everywhere
-    energy: Array  # (K, s + 1) I, with the pace
+    weight: Array  # (K, s + 1) Δ², times the pace
+    energy: Array  # (K, s + 1) I, its integral
     t: Array  # (M,)
     energy_at_t: Array  # (M,)
     floor: float  # size below which comparable η̂ is rounding
@@ -344,23 +345,53 @@ def scalar_path(
     energy = np.maximum.accumulate(Trajectory(mesh, weight).integral().values.ravel())
     energy = energy.reshape(delta.shape)  # ∫Δ² never falls
     at_t = np.maximum.accumulate(mesh.sampler(t)(energy))
-    return ScalarPath(mesh, signals, delta, digits, quotient, energy, t, at_t, floor, pace)
+    return ScalarPath(
+        mesh, signals, delta, digits, quotient, weight, energy, t, at_t, floor, pace
+    )
+
+
+def resolved(path: ScalarPath, gains: Array) -> ScalarPath:
+    """The path with elements within which e^{−γI} is known, for all of the gains (g, 1 or p).
+
+    Δ may grow by orders of magnitude within an element that resolves Ω, and what a large gain
+    makes of I is decided where Δ is smallest.
+    """
+    least, most = float(gains.min(initial=np.inf)), float(gains.max(initial=0.0))
+    before: Array | float = np.inf  # what was lost in the element that each one was cut from
+    while True:
+        mesh, begin = path.mesh, path.energy[:, 0]
+        size = np.maximum(path.weight.max(axis=1), np.finfo(float).tiny)[:, None]
+        tail = mesh.steps * legendre_tail(path.weight[..., None], mesh.rule, size)[:, 0]
+        gain = np.clip(1.0 / np.maximum(begin, np.finfo(float).tiny), least, most)
+        lost = gain * tail * np.exp(-gain * begin)
+        # A quarter of an element has a quarter of what is rounding, and much less of what is not.
+        poor = (lost > _TOLERANCE) & (lost < 0.05 * before)
+        if not poor.any() or mesh.size > MAX_ELEMENTS:
+            return path
+        parts = np.where(poor, 4, 1)
+        mesh, kept = mesh.split(parts)
+        before, new = np.where(poor, lost, before).repeat(parts), kept < 0
+        delta, digits, quotient = path.mixed[kept], path.digits[kept], path.quotient[kept]
+        found, Y, digits[new] = (
+            x.reshape(-1, *delta.shape[1:], *x.shape[1:])
+            for x in path.signals(mesh.points[new].ravel(), mesh.inside[new].ravel())
+        )
+        delta[new] = found
+        quotient[new] = Y / np.where(found, found, 1.0)[..., None]
+        quotient = filled(quotient, digits > SINGULAR)
+        path = scalar_path(
+            mesh, path.signals, delta, digits, quotient, path.t, path.floor, path.pace
+        )
 
 
 def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
-    The law takes c realisations as p·c parameters, in the order of (p, c) (SolverError: Ω is beyond
-    what a number can be; names the time).
+    The law takes c realisations as p·c parameters, in the order of (p, c) (SolverError: Ω or Δ² is
+    beyond what a number can be; names the time).
     """
-    p = extended.values.shape[-2]
-    finite = np.isfinite(extended.values)
-    if not finite.all():
-        first = int(np.argmin(finite.all(axis=(1, 2, 3))))
-        raise SolverError(
-            "Ω, which is made of squares of ψ, is too large for a number near t = "
-            f"{extended.mesh.edges[first]:.4g}; write Y and ψ in larger units"
-        )
+    p, mesh = extended.values.shape[-2], extended.mesh
+    _refuse_overflow("Ω, which is made of squares of ψ,", mesh, extended.values)
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
@@ -372,10 +403,22 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     digits = reciprocals(condition, usable)
+    _refuse_overflow("Δ² of Δ = det(Ω)", mesh, delta.reshape(*points, 1, 1) ** 2)
     return scalar_path(
-        extended.mesh, signals, delta.reshape(points), digits.reshape(points),
+        mesh, signals, delta.reshape(points), digits.reshape(points),
         filled(quotient.reshape(*points, -1), usable), t, floor,
     )
+
+
+def _refuse_overflow(what: str, mesh: Mesh, values: Array) -> None:
+    """SolverError if ``what`` has values (K, s + 1, …) that are beyond what a number can be."""
+    finite = np.isfinite(values)
+    if not finite.all():
+        first = int(np.argmin(finite.all(axis=(1, 2, 3))))
+        raise SolverError(
+            f"{what} is too large for a number near t = {mesh.edges[first]:.4g}; write Y and ψ in "
+            "larger units"
+        )
 
 
 def filled(quotient: Array, usable: BoolArray) -> Array:

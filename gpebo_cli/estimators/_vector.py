@@ -189,23 +189,21 @@ class VectorRecursion:
         self._left = np.broadcast_to(np.eye(len(start)), (*self._eta.shape, len(start)))
         self._most = 1.0
 
-    def advance(self, L: Array, N: Array, b: Array) -> tuple[Array, Array, BoolArray]:
-        """η̂ (g, K, p) at K samples, for L (g, K, p, m), N (K, m, p) and b (K, m).
+    def advance(self, L: Array, shrunk: Array, b: Array) -> tuple[Array, BoolArray]:
+        """η̂ (g, K, p) at K samples, for L (g, K, p, m), I − L N (g, K, p, p) and b = Nη (K, m).
 
-        Returns:
-            also I − L N (g, K, p, p), by which errors shrink, and whether enough of them has (K,)
+        The second result is whether enough of an error has gone by then, (K,).
         """
-        shrunk = np.eye(N.shape[-1]) - L @ N
-        out, left = np.empty((*L.shape[:2], N.shape[-1])), np.empty(len(N))
+        out, left = np.empty(shrunk.shape[:3]), np.empty(len(b))
         scale = self.roots[:, None] / self.roots[:, :, None]
-        for k in range(len(N)):
-            rest = b[k] - self._eta @ N[k].T
-            self._eta = self._eta + (L[:, k] @ rest[..., None])[..., 0]
+        for k in range(len(b)):
+            # Of b − N η̂ rounding would be left where N is large, and grow from sample to sample.
+            self._eta = (shrunk[:, k] @ self._eta[..., None])[..., 0] + L[:, k] @ b[k]
             self._left = shrunk[:, k] @ self._left
             out[:, k] = self._eta
             left[k] = np.linalg.norm(self._left * scale, 2, axis=(1, 2)).max()
         self._most = float(left[-1])
-        return out, shrunk, left <= _LEFT
+        return out, left <= _LEFT
 
     @property
     def requirement(self) -> Requirement:

@@ -16,6 +16,7 @@ from gpebo_cli.estimators._vector import (
     vector_estimates,
 )
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics
@@ -79,10 +80,12 @@ class RecursiveGradient(VectorRecursion):
         """
         rows, p, roots = regression.weighted(), regression.p, self.roots[:, None, None]
         U, sigma, Vt = np.linalg.svd(rows[..., :p] * roots, full_matrices=False)
-        done = -np.expm1(-np.minimum(sigma, _ALL) ** 2)
-        done = np.divide(done, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
+        sigma = np.where(sigma > p * EPS * sigma[..., :1], sigma, 0.0)  # else it is rounding
+        gone = -np.expm1(-np.minimum(sigma, _ALL) ** 2)
+        done = np.divide(gone, sigma, out=np.zeros_like(sigma), where=sigma > 0.0)
         L = transpose((U * done[..., None, :]) @ Vt * roots)
-        eta, shrunk, met = self.advance(L, rows[..., :p], rows[..., p])
+        shrunk = np.eye(p) - (transpose(Vt * roots) * gone[..., None, :]) @ (Vt / roots)
+        eta, met = self.advance(L, shrunk, rows[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δη̂' = (I − LN) δη̂ + L δY, of every case."""

@@ -24,6 +24,7 @@ from gpebo_cli.estimators._vector import (
 )
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.dynamics import Dynamics, filtered, state_of
@@ -117,10 +118,11 @@ class RecursiveMemoryExtension(VectorRecursion):
         self._before = extended[-1:]
         omega, roots = whole[..., :p], self.roots[:, None]
         M, V = np.linalg.eigh(roots[..., None] * omega * roots[..., None, :])
-        V = roots[..., None] * V
-        # It is the mean of e^{−x} over 0 to M.
-        L = (V * mean_decay(np.maximum(M, 0.0))[..., None, :]) @ transpose(V)
-        eta, shrunk, met = self.advance(L, omega, whole[..., p])
+        known = (M - p * EPS * M[..., -1:]) > 0.0  # others are rounding
+        V, M = roots[..., None] * (V * known[..., None, :]), np.maximum(M, 0.0)[..., None, :]
+        L = (V * mean_decay(M)) @ transpose(V)  # the mean of e^{−x} over 0 to M
+        shrunk = np.eye(p) + (V * np.expm1(-M)) @ (transpose(V) / roots[..., None, :] ** 2)
+        eta, met = self.advance(L, shrunk, whole[..., p])
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""

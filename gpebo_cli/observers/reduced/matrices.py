@@ -132,10 +132,15 @@ class ObserverMatrices:
         The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
         has to fulfil, and w must stay in range P.
         """
+        def less(own: Array, seen: Array) -> Array:
+            return without_rounding(
+                own - gain @ seen, np.abs(own) + np.abs(gain) @ np.abs(seen)
+            )
+
         return replace(
-            self, dynamics=self.dynamics - gain @ self.on_basis,
-            from_unknowns=self.from_unknowns - gain @ self.G,
-            from_signals=self.from_signals - gain @ self.g_signals,
+            self, dynamics=less(self.dynamics, self.on_basis),
+            from_unknowns=less(self.from_unknowns, self.G),
+            from_signals=less(self.from_signals, self.g_signals),
         )
 
 
@@ -239,14 +244,16 @@ def _by_steps(
     of_y = np.zeros((1, algebraic.shape[1], r))
     of_y[0, algebraic.shape[1] - r :] = -np.diag(scale)
     g_signals = joined(of_inputs, of_y, axis=2)
-    own = split.kernel / units.states[:, None]
-    kernel = split.kernel / np.linalg.norm(own, axis=1, keepdims=True)
+    own = without_rounding(split.kernel / units.states[:, None])
+    kernel = units.states[:, None] * (own / np.linalg.norm(own, axis=1, keepdims=True))
+    terms = np.abs(algebraic) @ np.abs(kernel)
+    on_kernel = without_rounding(algebraic @ kernel, terms)
     size = np.maximum(np.linalg.norm(algebraic * units.states, axis=(1, 2)), TINY)
-    arguments = system, algebraic @ kernel, kernel, size, t, rank_tol
+    arguments = system, on_kernel, kernel, size, t, rank_tol
     if frame is not None and frame.remaining is not None:
         Q1, K, injectivity = _eliminate_in_part(*arguments, units.states, frame.remaining.rank)
     else:
-        Q1, K, injectivity = _eliminate(*arguments)
+        Q1, K, injectivity = _eliminate(*arguments, terms)
     rounding = None
     if hidden is not None:
         outputs = Q1.shape[1] - r
@@ -302,8 +309,10 @@ def _held(found: ObserverMatrices, units: Array, rank_tol: float) -> ObserverMat
         return found
     rate = 2.0 * np.linalg.norm(found.dynamics * own / own[:, None], axis=(1, 2))
     gain = np.zeros((len(lacking), len(own), hidden + found.outputs))
-    gain[:, :, :hidden] = own[:, None] * np.linalg.pinv(lacking, rcond=_LACKING)
-    return found.injected(rate[:, None, None] * (gain @ found.residual))
+    inverse = np.asarray(np.linalg.pinv(lacking, rcond=_LACKING), dtype=np.float64)
+    gain[:, :, :hidden] = own[:, None] * without_rounding(inverse)
+    through = without_rounding(gain @ found.residual, np.abs(gain) @ np.abs(found.residual))
+    return found.injected(rate[:, None, None] * through)
 
 
 def _seen_through(
@@ -324,12 +333,13 @@ def _seen_through(
 
 def _eliminate(
     system: DescriptorSystem, on_kernel: Array, kernel: Array, size: Array, t: Array,
-    rank_tol: float,
+    rank_tol: float, terms: Array,
 ) -> tuple[Array, Array, Array]:
     """Q1 and H of K = (𝒜 Q)⁺ = H Q1ᵀ, and a bound of the singular value behind Assumption 1.
 
     From 𝒜 V2 on a basis V2 of the kernel of E (N, n, n_b), and the size (N,) of 𝒜. σ_min(R1) ≥
-    1/‖R1⁻¹‖_F; it is computed itself only where that bound leaves a doubt.
+    1/‖R1⁻¹‖_F; where that bound leaves a doubt, it is computed, of rows beside the sizes of their
+    ``terms``, those of 𝒜 V2: some may be small, but what is rounding sees nothing.
     """
     if kernel.shape[2] == 0:
         return on_kernel, kernel[:1], np.full(len(size), np.inf)
@@ -338,8 +348,8 @@ def _eliminate(
     bound = 1.0 / (np.linalg.norm(inverse, axis=(1, 2)) * size)
     doubtful = np.flatnonzero(~(bound > rank_tol))
     if len(doubtful):
-        sigma = np.linalg.svd(on_kernel[doubtful], compute_uv=False)
-        smallest = sigma[:, -1] / np.maximum(sigma[:, 0], TINY)
+        rows = np.maximum(terms[doubtful].max(axis=2, keepdims=True), TINY)
+        smallest = np.linalg.svd(on_kernel[doubtful] / rows, compute_uv=False)[:, -1]
         bound[doubtful] = smallest
         if (smallest <= rank_tol).any():
             k = int(np.argmax(smallest <= rank_tol))

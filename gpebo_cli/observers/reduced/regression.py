@@ -11,11 +11,13 @@ import numpy as np
 
 from gpebo_cli import kernels
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.reduction.form import EquationForm
 
 _ROUNDING = 1e-3  # of a projection, in terms of what is resolved
+_LITTLE = 1e-9  # of the largest state: a smaller one may be rounding
 _NOISE = 1e-11  # of the terms of a gain: beyond what extensions are resolved to
 VANISHING = 1e-11  # rows of Y and ψ below this share of the terms they are made of are zero
 OVER_TIME = ("Y", "psi", "offset", "gain")  # of what is assembled
@@ -34,6 +36,7 @@ class Assembled:
     eliminated: BoolArray  # (n,) states that take part in what is eliminated
     largest: Array  # (k, 1 + p) sizes of z over time
     moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
+    terms: Callable[[], Array]  # (n, p) of all that the gain is made of
 
     def kinds(
         self, units: Array | float = 1.0, basis: Array | None = None,
@@ -66,6 +69,13 @@ class Assembled:
         states = np.maximum(states, 1e-3 * (self.moving / columns).max(axis=1, initial=0.0))
         if rounding is not None:
             states = np.maximum(states, self._through(rounding))
+        beside = states / units
+        if beside.min(initial=np.inf) < _LITTLE * beside.max(initial=0.0):
+            # What is rounding of its terms, or of other states, is no signal either.
+            each = np.broadcast_to(units, len(states))[:, None]
+            others_leave = 64 * EPS * each * (largest / each).max(axis=0)
+            nothing = largest <= np.maximum(_NOISE * self.terms(), others_leave)
+            states[nothing.all(axis=1)] = np.inf
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
         yield self.offset / units, 0.0
@@ -134,7 +144,15 @@ def regression_signals(
         psi = np.where(nothing, 0.0, psi)
     largest, used = largest_over_time(z), np.asarray(largest_over_time(H).any(axis=1))
     moving = np.abs(basis) @ largest[:, 1:]
-    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
+
+    def terms() -> Array:
+        seen = largest_over_time(algebraic) @ largest[:, 1:]
+        seen[:, :q] += largest_over_time(G)
+        return moving + largest_over_time(H) @ (largest_over_time(Q1).T @ seen)
+
+    return Assembled(
+        Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving, terms
+    )
 
 
 def resolve(found: Assembled, some: slice, terms: Array, form: EquationForm) -> None:

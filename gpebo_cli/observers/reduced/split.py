@@ -271,5 +271,5 @@ def initial_basis(
         norm = float(np.linalg.norm(v))
         if norm > 1e-6 and len(columns) < rank:
             columns.append(v / norm)
-    V = np.array(columns).T.reshape(len(P), -1)
+    V = without_rounding(np.array(columns).T.reshape(1, len(P), -1))[0]
     return units[:, None] * V, V.T / units, tuple(f"e0_{i + 1}" for i in range(rank))
