@@ -56,8 +56,7 @@ def rough(system, hold, rows=700, horizon=4.0):
     return Measurements(*signals)
 
 
-@pytest.mark.parametrize("at_once", [8192, 50])
-@pytest.mark.parametrize("hold", ["linear", "zoh"])
+@pytest.mark.parametrize(("hold", "at_once"), [("linear", 50), ("zoh", 8192)])
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "strangeness_free", "steps", "fast"])
 def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(
     name, hold, at_once, monkeypatch
