@@ -322,6 +322,17 @@ def test_observers_of_the_current_state_take_the_same_form(observer):
     assert np.abs(result.errors["flow"][0, -1]) < 1e-6
 
 
+def test_a_recorded_input_that_a_hidden_constraint_differentiates_is_named():
+    """Of the four inputs u4 is the only one whose derivative is needed."""
+    made = run(CAPACITORS, observer="none", time={"horizon": 3, "samples": 301})
+    names = [*CAPACITORS["inputs"], *CAPACITORS["outputs"]]
+    frame = made.to_pandas("signals")[["t", *names]]
+    found = run(CAPACITORS, data={"frame": frame, "hold": "cubic"}, estimator="least_squares")
+    told = "; derivatives of u4 are its interpolant's, which amplify its noise"
+    assert told in found.verdict
+    assert "derivatives of" not in found.verdict.replace(told, "")
+
+
 def test_a_noisy_input_in_a_hidden_constraint_is_named():
     with pytest.raises(ConfigError, match=r"u4, a hidden constraint on i, is contains .* order 1"):
         observed(CAPACITORS, noisy=("u4",))

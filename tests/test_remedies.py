@@ -232,7 +232,7 @@ def test_the_regression_holds_in_every_segment(name):
     """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
     system, signals, observation = observed(name, remedy="reset", reset_interval=4.0)
     t = np.linspace(0.0, 20.0, 401)
-    assert len(observation.regression.resets) == 4
+    assert [reset.time for reset in observation.regression.resets] == [4.0, 8.0, 12.0, 16.0]
     assert max(left_of_identities(system, signals, observation, t)) < 1e-9
     eta = observation.truth(t, system.theta_at(t), signals.states)
     for reset in observation.regression.resets:
