@@ -326,7 +326,7 @@ def test_a_recorded_input_that_a_hidden_constraint_differentiates_is_named():
     """Of the four inputs u4 is the only one whose derivative is needed."""
     made = run(CAPACITORS, observer="none", time={"horizon": 3, "samples": 301})
     names = [*CAPACITORS["inputs"], *CAPACITORS["outputs"]]
-    frame = made.to_pandas("signals")[["t", *names]]
+    frame = made.to_pandas("signals").reset_index()[["t", *names]]
     found = run(CAPACITORS, data={"frame": frame, "hold": "cubic"}, estimator="least_squares")
     told = "; derivatives of u4 are its interpolant's, which amplify its noise"
     assert told in found.verdict

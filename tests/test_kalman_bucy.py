@@ -436,13 +436,13 @@ def test_the_error_estimate_is_that_of_a_finer_solution(hold):
     """Along a rough recording: neither a tenth nor ten times of what a finer tolerance changes."""
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(0.02, 0.3, 60))
-    data = {"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
+    data = pd.DataFrame({"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)})
     plant = one_state(
         inputs={"u": 0}, unknowns={"gain": 1, "leak": 1}, A=[[-1]], F=[["u", -1]], initial_state=[0]
     )
     rough, fine = (
         api_run(
-            plant, observer="kalman_bucy", data={**data, "hold": hold}, solver={"tol": tol},
+            plant, observer="kalman_bucy", solver={"tol": tol}, data={"frame": data, "hold": hold},
             noise={"name": "gaussian", "outputs": 0.1}, time={"samples": 997},
         ).details for tol in (1e-2, 1e-11)
     )
