@@ -243,6 +243,27 @@ def test_noise_of_an_input_that_stands_in_the_matrices_has_no_linear_response(de
     assert (found.errors is not None) == stated
 
 
+@pytest.mark.parametrize("observer", [
+    {"name": "gpebo"}, {"name": "gpebo", "remedy": "output_injection"},
+])
+@pytest.mark.parametrize(("follows", "levels", "linear"), [
+    ("y", None, False), ("y", [0, 0, 0], False), ("y", [0.1, 0, 0], True),
+    ("y", [0, 0.1, 0], False), ("y", [0, 0, 0.1], True), ("u", None, True),
+    ("u", [0, 0, 0], True), ("u", [0.1, 0, 0], False), ("u", [0, 0.1, 0], True),
+    ("t", [0.1, 0.1, 0.1], True),
+])
+def test_errors_are_linear_unless_matrices_follow_what_is_noisy(follows, levels, linear, observer):
+    """Where no level is said, or all are zero, the outputs are."""
+    system = plant_from_mapping(one_state(
+        A=[[f"-1 - {follows}**2"]], inputs={"u": "sin(t)"}, B=[[1]], outputs=["y", "z"],
+        C=[[1], [2]],
+    ))
+    signals = simulate(system, TimeSettings(horizon=1.0), SolverSettings()).signals
+    noise = None if levels is None else SignalNoise(np.array(levels[:1]), np.array(levels[1:]), 0.1)
+    found = observe(system, replace(seen(signals), noise=noise), SolverSettings(), **observer)
+    assert (found.errors is not None, found.respond is not None) == (linear, linear)
+
+
 def test_what_is_found_along_one_recording_is_not_believed_along_another():
     """A rank of the same plant, in the same process, that the measured signal decides."""
     plant = plant_from_mapping({

@@ -217,9 +217,18 @@ def test_matrices_against_their_definition():
             for row in (["c1", "c2", "sin(t)"], ["c1", "c2", -0.1], ["c1", "cos(t)", 0],
                         ["cos(t)", "c2", 0], [1e-10, "c2", 0])
         ),
+        *((
+            {"A": (np.diag([-1.0, -2, 1, 1, 1]) + entry * np.eye(5, k=-2)).tolist()}, {},
+            ModelError, rf"A\[2\]\[0\] is {entry} at t = 0 instead of 0",
+        ) for entry in (0.2, -0.2)),
         (
-            {"A": (np.diag([-1.0, -2, 1, 1, 1]) + 0.2 * np.eye(5, k=-2)).tolist()}, {},
-            ModelError, r"A\[2\]\[0\] is 0\.2 at t = 0 instead of 0",
+            {"E": [[1, 0, 0, 0, 0], [0, 1, 0, 0, 0], [0, 0, 0, -2, 0], [0, 0, "N21", 0, 0],
+                   [0, 0, "N31", 0, 0]]}, {},
+            ModelError, r"E\[2\]\[3\] is -2 at t = 0 instead of 0 .* here n_a = 2\)",
+        ),
+        (
+            {"unknowns": {"a": 1}, "F": [[0], [0], [0], [-1], [0]]}, {},
+            ModelError, "takes unknown parameters in the equations of z_a only",
         ),
         ({}, {"output": "y1"}, ModelError, "Assumption 6 fails: output y1"),
         ({}, {"output": "y9"}, ConfigError, "'y9' is not an output"),

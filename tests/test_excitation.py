@@ -17,6 +17,7 @@ from gpebo_cli import run
 from gpebo_cli.evidence.excitation import assess, persistent, sampled_window_level
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
 
@@ -285,3 +286,39 @@ def test_the_last_line_says_how_much_of_a_recording_is_explained():
     power = [(left[k:] * left[: len(left) - k]).sum() for k in range(21)]
     np.testing.assert_allclose(fit.correlation, np.array(power[1:]) / power[0], atol=1e-6)
     assert (fit.lag, fit.band) == pytest.approx((0.1, 1.96 / np.sqrt(201.0)))
+
+
+def test_integrals_early_in_an_element_are_no_more_wrong_than_is_said():
+    """∫ψᵀψ of ψ = (1, t) beside its closed form, from 1e-15 of the first element on."""
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([np.ones_like(t), t], axis=-1)[..., None, :],
+        lambda t: t[..., None], ["a", "b"], 8.0, 4,
+    )
+    t = np.concatenate([np.geomspace(2e-15, 1.9, 40), 2.0 + np.geomspace(1e-9, 1.9, 9)])
+    gram, rounding = made.gram_with_rounding(t)
+    exact = np.stack([t, t**3 / 3.0], axis=1)
+    wrong = np.abs(np.einsum("mjj->mj", gram[..., :2]) - exact)
+    assert (wrong <= rounding + 1e-15 * exact).all()
+    end = np.floor(t / 2.0 + 1.0) * 2.0  # of its element
+    size = np.stack([end, end**3 / 3.0], axis=1) * (t % 2.0 / 2.0)[:, None]
+    assert (rounding <= 1e-11 * size).all()
+
+
+def test_terms_are_the_largest_so_far_and_at_an_edge_those_before_it():
+    made = LinearRegression.from_functions(
+        lambda t: t[..., None, None], lambda t: t[..., None], ["a"], 4.0, 4
+    )
+    assert made.scale == 4.0  # the largest entry of ψ
+    made = replace(made, scale=np.array([[1.0], [2.0], [5.0], [7.0]]))
+    assert made.terms(np.array([0.0, 0.5, 1.0, 1.5, 3.0, 3.5, 4.0]))[:, 0].tolist() == [
+        1.0, 1.0, 1.0, 2.0, 5.0, 7.0, 7.0,
+    ]
+
+
+def test_least_squares_leave_a_parameter_that_nothing_depends_on_at_zero():
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([np.cos(t), 0.0 * t], axis=-1)[..., None, :],
+        lambda t: 3.0 * np.cos(t)[..., None], ["a", "b"], 4.0, 4,
+    )
+    np.testing.assert_allclose(made.least_squares(), [3.0, 0.0], atol=1e-12)
+    assert made.misfit(np.array([1.0, 7.0])) == pytest.approx(4.0 * (2.0 + np.sin(8.0) / 4.0))

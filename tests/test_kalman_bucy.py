@@ -216,19 +216,26 @@ def test_window_is_exciting_but_not_uniformly_observable():
 def test_uniform_observability_is_measured_by_P0():
     """Of states that stand still the Gramian is ∫CᵀV⁻¹C: one known at the start counts as others.
 
-    λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations.
+    λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations. Here
+    it is that of a, which is seen less and less.
     """
     result = api_run(
         {"name": "still", "states": ["a", "b", "c"], "outputs": ["y1", "y2", "y3"],
          "E": np.eye(3).tolist(), "A": np.zeros((3, 3)).tolist(),
-         "C": np.diag([1, 2, 1]).tolist(), "initial_state": [1, 2, 3]},
+         "C": [["exp(-t/5)", 0, 0], [0, 2, 0], [0, 0, 1]], "initial_state": [1, 2, 3]},
         observer={"name": "kalman_bucy", "P0": {"w_a": 4.0, "w_b": 9.0, "w_c": 0.0}},
         noise={"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}, time={"horizon": 5.0},
     )
-    found = result.details.estimation.requirement
-    unit = found.evidence["window"] / (0.02**2 * 0.1)
-    assert found.evidence["lambda_min"] == pytest.approx(4.0 * unit, rel=1e-6)
+    found, unit = result.details.estimation.requirement, 1.0 / (0.02**2 * 0.1)
+    first, last = (2.5 * (np.exp(-0.4 * t) - np.exp(-0.4 * t - 0.2)) for t in (0.0, 4.5))
+    longer = {"largest_lambda_min": 4.0 * unit * first, "needed": 1e-8 * 9.0 * 2.0**2 * 0.5 * unit}
+    for key, value in longer.items():  # of windows that end at an edge
+        assert 1.0 <= found.evidence[key] / value < 1.25
+    assert found.evidence == pytest.approx({
+        **found.evidence, "window": 0.5, "window_start": 4.5, "lambda_min": 4.0 * unit * last,
+    }, rel=1e-6)
     assert found.holds
+    assert f"falls to {4.0 * unit * last:.3g} of P0⁻¹ (from t = 4.5 s on; evi" in found.text
 
 
 def test_a_wandering_unknown_is_followed():
@@ -341,13 +348,16 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     noise = {"noise": {"name": "gaussian", "outputs": sigma}} if level == "given" else {}
     result = api_run(
         plant, observer={"name": "kalman_bucy", "P0": 1e4}, data=pd.DataFrame({"t": t, "y": y}),
-        time={"samples": 11}, **noise,
+        time={"samples": 89}, **noise,
     )
     # By information, 1/σ²h per second: the pause has as much as one sample.
     of_mean, estimation = sigma / np.sqrt(len(h)), result.details.estimation
+    first = estimation.states_std[0, 1, 0]  # after five samples
+    assert first == pytest.approx(sigma / np.sqrt(5), rel=1e-3 if level == "given" else 0.08)
     assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.08)
     assert abs(result["x_hat"][0, -1] - 2.0) < 3 * of_mean
-    assert ("taken from the residual, 0.3" in result.verdict) == (level != "given")
+    told = "taken from the residual, 0.3" if level != "given" else "noise of the outputs"
+    assert (told in result.verdict) == (level != "given")
 
 
 @pytest.mark.parametrize(("rate", "told"), [
@@ -370,6 +380,18 @@ def test_a_wrong_plant_does_not_explain_a_recording(rate, told):
     off = abs(found.estimates["leak"][0, -1] - leak) / std
     assert (off < 3.0) == (rate == -0.5)
     assert told in found.verdict
+
+
+def test_what_may_drift_explains_no_data():
+    """Least squares of constants say nothing of a filter that takes one of them to wander."""
+    t = np.linspace(0.0, 5.0, 201)
+    plant = one_state(unknowns={"leak": 1.0}, F=[[-1]], initial_state=[0])
+    data = {"t": t, "y": -t + 0.01 * np.random.default_rng(0).standard_normal(201)}
+    told = [
+        api_run(plant, data=data, observer={"name": "kalman_bucy", "process": process}).verdict
+        for process in (0.0, {"leak": 0.1})
+    ]
+    assert ["explain the data" in verdict for verdict in told] == [True, False]
 
 
 @pytest.mark.parametrize("hold", ["linear", "zoh"])
@@ -414,13 +436,13 @@ def test_the_error_estimate_is_that_of_a_finer_solution(hold):
     """Along a rough recording: neither a tenth nor ten times of what a finer tolerance changes."""
     rng = np.random.default_rng(0)
     t = np.cumsum(rng.uniform(0.02, 0.3, 60))
-    data = {"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)}
+    data = pd.DataFrame({"t": t, "u": rng.standard_normal(60), "y": rng.standard_normal(60)})
     plant = one_state(
         inputs={"u": 0}, unknowns={"gain": 1, "leak": 1}, A=[[-1]], F=[["u", -1]], initial_state=[0]
     )
     rough, fine = (
         api_run(
-            plant, observer="kalman_bucy", data={**data, "hold": hold}, solver={"tol": tol},
+            plant, observer="kalman_bucy", solver={"tol": tol}, data={"frame": data, "hold": hold},
             noise={"name": "gaussian", "outputs": 0.1}, time={"samples": 997},
         ).details for tol in (1e-2, 1e-11)
     )

@@ -19,9 +19,10 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import OnDemand
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.mesh import SHARE, Mesh, initial_mesh
+from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import AffineStateMap
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.reduction import scaling
 from gpebo_cli.reduction.constant import constant_form
@@ -816,6 +817,21 @@ def test_one_case_with_many_parameters_is_measured_as_many_cases_are():
     assert found[0]["rms_error_states"] > 1e-3
     for name in ("seconds_to_1pct_states", "final_error_states", "rms_error_states"):
         assert found[0][name] == pytest.approx(found[1][name], rel=1e-6, nan_ok=True)
+
+
+@pytest.mark.parametrize("p", [3, 40])
+def test_states_of_cases_side_by_side_are_those_of_each(p):
+    """Of one case with many parameters gains are not sampled."""
+    mesh = initial_mesh(0.0, 3.0, [], 4, radau_rule(5))
+    wave = np.sin(mesh.points[..., None, None] + np.arange(2.0 * p).reshape(2, p))
+    states = AffineStateMap(mesh.trajectory(wave[..., 0].reshape(-1, 2)), Trajectory(mesh, wave))
+    t = np.linspace(0.0, 3.0, 11)
+    eta = np.random.default_rng(0).normal(size=(3, 11, p))
+    exact = states.offset(t) + np.einsum("mij,gmj->gmi", states.gain(t), eta)
+    np.testing.assert_allclose(states.at(t)(eta), exact, rtol=1e-12, atol=1e-12)
+    for k in range(3):
+        found = states.at(t)(eta[k : k + 1])[0]
+        np.testing.assert_allclose(found, exact[k], rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("chain", [0.0, 1.0])

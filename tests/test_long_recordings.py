@@ -18,13 +18,16 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
 from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, build, gpebo
 from gpebo_cli.observers._base import SignalNoise
-from gpebo_cli.observers.reduced import extension
+from gpebo_cli.observers.reduced import condensed, extension
 from gpebo_cli.observers.reduced import system as reduced
 from gpebo_cli.recordings.hold import held, recording_mesh
+from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression import linear
+from gpebo_cli.regression.errors import ErrorSystem
 from gpebo_cli.regression.estimator import Lasting, Unmixed
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
@@ -53,10 +56,13 @@ def rough(system, hold, rows=700, horizon=4.0):
     return Measurements(*signals)
 
 
-@pytest.mark.parametrize("hold", ["linear", "zoh"])
+@pytest.mark.parametrize(("hold", "at_once"), [("linear", 50), ("zoh", 8192)])
 @pytest.mark.parametrize("name", ["circuit", "descriptor", "strangeness_free", "steps", "fast"])
-def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, hold):
+def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(
+    name, hold, at_once, monkeypatch
+):
     """G, h, the misfit and x at the wanted times, of signals that no long element resolves."""
+    monkeypatch.setattr(condensed, "_AT_ONCE", at_once)
     system = plant_from_mapping(PLANTS[name], name) if name in PLANTS else shipped(name)
     signals, wanted = rough(system, hold), np.linspace(0.0, 4.0, 23)
     whole, few = (
@@ -74,6 +80,79 @@ def test_the_long_elements_of_a_regression_keep_what_the_short_ones_say(name, ho
     residual = whole.regression.Y(at) - whole.regression.psi(at) @ eta
     rms = np.sqrt((residual**2).sum(axis=1).mean())
     assert np.sqrt(few.regression.misfit(eta) / 4.0) == pytest.approx(rms, rel=1e-8)
+
+
+@pytest.mark.parametrize("name", ["gpebo", "kalman_bucy"])
+def test_the_error_of_what_all_rows_add_is_in_the_estimate(name, monkeypatch):
+    driven, system = condensed.driven, plant_from_mapping(STEP)
+    noise = SignalNoise(np.zeros(1), np.full(2, 0.1), 0.01)
+    signals = replace(
+        rough(system, "linear", rows=300), noise=noise, wanted=np.linspace(0.0, 4.0, 5)
+    )
+    monkeypatch.setattr(condensed, "driven", lambda *a, **k: (*driven(*a, **k)[:2], 0.125))
+    found = build({"name": name}).observe(system, signals, SolverSettings())
+    assert found.error_estimate == 0.125
+
+
+def test_a_long_recording_is_thinned_to_lines_between_wanted_times_and_where_matrices_jump():
+    system, solver = plant_from_mapping(STEP), SolverSettings()
+    signals = rough(system, "linear", rows=300)
+    wanted = signals.mesh.edges[[20, 100, 201]]
+    few = condensed.thinned(system, replace(signals, wanted=wanted), solver)
+    assert few.mesh.edges.tolist() == sorted([0.0, *wanted, 1.2345, 4.0])
+    both = few.at(few.mesh.edges)
+    np.testing.assert_allclose(both, signals.at(few.mesh.edges), atol=1e-12)
+    middle = few.at(0.5 * (few.mesh.edges[1:] + few.mesh.edges[:-1]))
+    np.testing.assert_allclose(middle, 0.5 * (both[1:] + both[:-1]), atol=1e-12)
+    count = signals.mesh.size // 8
+    derivatives = InputDerivatives.of_plant(system, np.ones(1, dtype=bool))
+    battery = shipped("battery")
+    for plant, changes in (
+        (system, {"wanted": None}), (system, {"wanted": np.linspace(0.0, 4.0, count + 1)}),
+        (system, {"wanted": wanted, "derivatives": derivatives}), (battery, {"wanted": wanted}),
+    ):
+        assert condensed.thinned(plant, replace(signals, **changes), solver) is None
+    most = replace(signals, wanted=np.linspace(0.0, 4.0, count))
+    assert condensed.thinned(system, most, solver) is not None
+
+
+@pytest.mark.parametrize("hold", ["linear", "zoh"])
+def test_where_states_have_bounds_the_map_is_kept_at_all_rows(hold):
+    system = plant_from_mapping(STEP)
+    signals, wanted = rough(system, hold), np.linspace(0.0, 4.0, 23)
+    whole, few = (
+        build({"name": "gpebo", "bounds": {"states": {"x1": [-9.0, 9.0]}}}).observe(
+            system, each, SolverSettings()
+        ).state_map for each in (signals, replace(signals, wanted=wanted))
+    )
+    assert set(signals.mesh.edges) | set(wanted) <= set(few.offset.t)
+    inside = np.minimum(few.offset.t + 1e-9, 4.0)
+    for part in ("offset", "gain"):
+        expected = getattr(whole, part)(few.offset.t, inside)
+        np.testing.assert_allclose(
+            getattr(few, part)(few.offset.t), expected, atol=1e-8 * np.abs(expected).max()
+        )
+
+
+@pytest.mark.parametrize(
+    ("rate", "size", "interpolated"), [(1.0, 2, True), (60.0, 2, False), (1.0, 40, False)]
+)
+def test_a_system_of_errors_is_interpolated_where_it_is_small_and_the_mesh_resolves_it(
+    rate, size, interpolated
+):
+    asked, long = [], mesh.initial_mesh(0.0, 2.0, [], 4, radau_rule(9))
+
+    def errors(t, inside):
+        asked.append(t)
+        A = np.sin(rate * t)[:, None, None] + np.arange(size**2).reshape(size, size)
+        return ErrorSystem(A, np.ones((1, size, 3)), 2.0 * A[:, :1], np.zeros((1, 1, 3)))
+
+    t = np.linspace(0.0, 2.0, 41)
+    for found, expected in zip(
+        condensed._interpolated(errors, long, 1e-10)(t, t), errors(t, t), strict=True
+    ):
+        np.testing.assert_allclose(found + 0.0 * expected, expected + 0.0 * found, atol=1e-9)
+    assert len(asked) == (2 if interpolated else 3)
 
 
 @pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])

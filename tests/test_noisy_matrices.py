@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from plants import one_state, shipped
@@ -10,7 +13,10 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.experiment.noise import measure, noise_levels
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, observe
+from gpebo_cli.observers.remedies.noise_free import _change
+from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
@@ -101,6 +107,19 @@ def test_unknowns_in_a_noisy_output_are_linearised_with_it():
         slope = misfit(best + step) - misfit(best - step)
         curvature = misfit(best + step) + misfit(best - step) - 2 * misfit(best)
         assert abs(slope) < 0.05 * curvature
+
+
+def test_what_still_changes_is_measured_by_the_residual():
+    """Of Y = 3 + cos 9t and ψ = 1 on 2π: the residual of 3 has the root mean square 1/√2."""
+    made = LinearRegression.from_functions(
+        lambda t: np.ones((*t.shape, 1, 1)), lambda t: 3.0 + np.cos(9.0 * t)[..., None], ["a"],
+        2.0 * np.pi, 400,
+    )
+    change = _change(SimpleNamespace(regression=made), np.array([3.1]), np.array([3.0]), 0.0)
+    assert change == pytest.approx(0.1 * np.sqrt(2.0), rel=0.02)
+    exact = replace(made, Y=Trajectory(made.mesh, 3.0 + 0.0 * made.Y.values))
+    change = _change(SimpleNamespace(regression=exact), np.array([3.1]), np.array([3.0]), 1e-6)
+    assert change == pytest.approx(0.1 / (1e-6 * 6.0 / 1e-3))  # rounding is no residual
 
 
 def test_a_copy_that_does_not_settle_is_refused(monkeypatch):

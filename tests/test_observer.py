@@ -14,7 +14,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
-from gpebo_cli.observers.reduced.split import axes_frame
+from gpebo_cli.observers.reduced.split import axes_frame, constant_split
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -81,6 +81,8 @@ def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
     assert observation.of_constants is observation.state_map
     assert replace(observation, estimator=estimators.build({"name": "drem"})).of_constants is None
     assert replace(observation, names=("a",)).of_constants is None
+    for observer in ({"remedy": "reset", "reset_interval": 5.0}, {"remedy": "current_coordinates"}):
+        assert run(shipped("descriptor"), **observer)[1].of_constants is None
 
 
 def test_circuit_regressor_matches_the_reference_up_to_sign():
@@ -180,10 +182,12 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
 
 def test_the_weakest_singular_value_is_found_among_bounds_of_it():
     H = np.random.default_rng(0).normal(size=(40, 5, 3))
+    H *= np.array([1.0, 1e-3, 1e-3])
     H[:, :, 0] *= np.linspace(1.0, 3.0, 40)[:, None]
     smallest = 1.0 / np.linalg.norm(H, 2, axis=(1, 2))
     value, place = weakest(1.0 / np.linalg.norm(H, axis=(1, 2)), H)
     assert (value, place) == (pytest.approx(smallest.min()), smallest.argmin())
+    assert weakest(np.full(3, np.inf), H[:3, :, :0]) == (np.inf, 0)  # nothing is eliminated
 
 
 def test_rotating_kernel_with_unknown_parameter():
@@ -248,6 +252,21 @@ def test_starting_value_of_the_extension_is_free():
     np.testing.assert_allclose(truth, [0, -1, -2], atol=1e-12)
 
 
+@pytest.mark.parametrize(("xi_a0", "starts"), [
+    (None, [0.0, 1.0, 5.0]), ({"b": 2.0}, [0.0, 2.0, 5.0]), ({"a": 0.3, "c": 4}, [0.3, 1.0, 4.0]),
+    ([0.1, 0.2, 0.3], [0.1, 0.2, 0.3]),
+])
+def test_known_initial_values_are_those_said_or_the_plants(xi_a0, starts):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "c"], "outputs": ["y"], "E": np.eye(3).tolist(),
+        "A": np.diag([-1, -2, -3]).tolist(), "C": [[1, 1, 1]], "initial_state": [7, 1, 5],
+    })
+    _, found = observed(plant, 1.0, unknown_initial=["a"], xi_a0=xi_a0)
+    assert found.regression.parameters == ("e0_a",)
+    np.testing.assert_allclose(found.state_map.offset(np.zeros(1))[0], starts, atol=1e-12)
+    np.testing.assert_allclose(found.state_map.gain(np.zeros(1))[0, :, 0], [-1, 0, 0], atol=1e-12)
+
+
 @pytest.mark.parametrize("observer", ["gpebo", "kalman_bucy"])
 @pytest.mark.parametrize("speed", [1.0, 7.3])
 def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed, observer):
@@ -275,6 +294,26 @@ def test_what_no_output_sees_is_not_excited_by_rounding(g):
     assert not found.excitation.is_ie
     unknown = {name for name, since in found.estimable.items() if since is None}
     assert unknown == {"a", "b", "e0_2"}
+
+
+@pytest.mark.parametrize("units", [np.ones(4), 10.0 ** np.array([3, -4, 0, 5])])
+def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
+    rng, t = np.random.default_rng(3), np.linspace(0.0, 2.0, 5)
+    E = rng.normal(size=(4, 2)) @ np.diag([1.0, 1e-7]) @ rng.normal(size=(2, 4))
+    moving = (1.0 + 0.5 * np.sin(t))[:, None, None] * E
+    found = constant_split(moving / units, tuple("abcd"), units, 1e-10)
+    assert found.rank == 2
+    assert found.frame is not None
+    P = found.projector[0] * units / units[:, None]
+    np.testing.assert_allclose(P @ P, P, atol=1e-12)
+    np.testing.assert_allclose(P, P.T, atol=1e-12)
+    np.testing.assert_allclose(E @ P, E, atol=1e-12)
+    np.testing.assert_allclose(found.pinv @ (moving / units) - found.dual @ found.projector, 0.0,
+                               atol=1e-6 * np.abs(found.dual).max())
+    turn = np.eye(4) + 1e-12 * t[:, None, None] * rng.normal(size=(4, 4))
+    assert constant_split(moving @ turn / units, tuple("abcd"), units, 1e-10) is None
+    small = constant_split(moving / units, tuple("abcd"), units, 1e-6)
+    assert small is None or small.rank == 1
 
 
 def test_axes_of_what_is_differentiated_are_exact():

@@ -64,6 +64,20 @@ def test_it_is_weighted_least_squares_in_the_box():
         assert (found <= p.high).all()
 
 
+def test_fits_side_by_side_are_those_of_each_whatever_the_size_of_the_weights():
+    p, rng = regression_from_mapping(TEXT).parametrisation, np.random.default_rng(2)
+    roots = rng.normal(size=(9, 4, 4))
+    weights = np.swapaxes(roots, 1, 2) @ roots
+    eta = S(rng.uniform(p.low, p.high, (9, 2))) + 0.3 * rng.normal(size=(9, 4))
+    eta[4, 1] = np.nan
+    alone = np.concatenate([p.fitted(eta[k : k + 1], weights[k : k + 1]) for k in range(9)])
+    assert np.isfinite(alone).all(axis=1).tolist() == [k != 4 for k in range(9)]
+    for size in (1e-9, 1e9):
+        np.testing.assert_allclose(p.fitted(eta, size * weights), alone, rtol=1e-7)
+        gains = (p.gain(alone[:4], by * weights[:4]) for by in (size, 1.0))
+        np.testing.assert_allclose(*gains, rtol=1e-9)
+
+
 def test_least_squares_then_means_nonlinear_least_squares_on_the_data():
     noise = {"name": "gaussian", "outputs": 0.2, "sample_time": 0.05}
     found = run(regression=TEXT, estimator={"name": "least_squares", "f0": 1e-12},
@@ -113,7 +127,8 @@ def test_deviations_of_the_unknowns_follow_from_those_of_the_parameters():
     ({"box": None}, "S needs a box"),
     ({"box": {"a": [0, 1]}}, "box.b must be [low, high]"),
     ({"box": {**TEXT["box"], "c": [0, 1]}}, "box.c is not an unknown (a, b)"),
-    ({"box": {**TEXT["box"], "a": [2, 1]}}, "box.a must be [low, high] with low < high"),
+    *(({"box": {**TEXT["box"], "a": ends}}, "box.a must be [low, high] with low < high")
+      for ends in ([2, 1], [2, 2])),
     ({"S": None}, "box is for S"),
     ({"S": ["a", "b", "a*c", "1"]}, "S[2]"),
     ({"psi": [["u", "1"]]}, "an entry for each of the 4 unknowns (eta_1, eta_2, eta_3, eta_4)"),

@@ -221,6 +221,8 @@ def test_of_calls_from_python(tmp_path):
     for call, error, message in (
         (lambda: run(data={"t": [0.0, 1.0], "y": [0.0]}), ConfigError,
          "data: arrays of the shapes t (2,), y (1,): "),
+        (lambda: run(data={"t": [0.0, 1.0], "y": [0.0, 1.0], "hold": "zoh"}), ConfigError,
+         "data: 'hold' is no array; how rows are read stands beside all of them"),
         (lambda: run(data={"name": "csv", "file": [["a.csv"], ["b.csv"]]}), ConfigError,
          "data.file: "),
         (lambda: from_control(SimpleNamespace(B=np.eye(1)), "p"), ConfigError,

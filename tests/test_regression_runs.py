@@ -109,19 +109,32 @@ def test_at_samples_operators_are_those_of_the_held_signals(hold, order):
     assert np.log2(error[1] / error[2]) == pytest.approx(order, abs=0.35)
 
 
+def test_one_unknown_is_found_at_samples():
+    given = {**SINE, "unknowns": {"a": 2.0}, "psi": [["s"]]}
+    found = run(
+        regression=given, estimator={"name": "least_squares", "f0": 1e-12}, time={"horizon": 2},
+        observer={"sample_time": 0.1}, noise={"name": "gaussian", "outputs": 1e-6},
+    )
+    assert found.estimates["a"][0, -1] == pytest.approx(2.0, abs=1e-5)
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_samples_may_come_in_any_pieces(hold):
     text = regression_from_mapping({**OPERATORS, "signals": {"s": None}})
     t = np.cumsum(np.random.default_rng(1).uniform(0.01, 0.1, 80))
-    s = np.sin(3 * t)[:, None]
+    s = (-np.exp(-t) * np.sin(3 * t))[:, None]
     Y = np.cos(t)[:, None]
     _, whole = text.advance(hold, None, t, s, Y)
-    state, rows = None, []
+    state = None
     for part in (slice(0, 1), slice(1, 2), slice(2, 30), slice(30, 31), slice(31, 80)):
         state, piece = text.advance(hold, state, t[part], s[part], Y[part])
-        rows.append(piece.rows[1:])
-        np.testing.assert_allclose(piece.scale, whole.scale[part], rtol=1e-12)
-    np.testing.assert_allclose(np.concatenate(rows), whole.rows[1:], rtol=1e-12, atol=1e-14)
+        rows = whole.rows[part.start : part.stop + 1]
+        np.testing.assert_allclose(piece.rows, rows, rtol=1e-12, atol=1e-14)
+        largest = np.maximum.accumulate(np.abs(whole.rows[1:, :, :-1]).max(axis=1))
+        np.testing.assert_array_equal(whole.scale, largest)
+        for name in ("scale", "steps", "t"):
+            expected = getattr(whole, name)[part]
+            np.testing.assert_allclose(getattr(piece, name), expected, rtol=1e-12)
 
 
 def test_a_stream_is_the_file_at_its_samples(tmp_path):
@@ -151,6 +164,14 @@ def test_deviations_of_known_noise_of_y_are_those_of_many_seeds(psi):
     np.testing.assert_allclose(found.noise.deviation[0], stated, rtol=0.12)
     at_samples = run(**given, noise={**noise, "seeds": 1}, observer={"sample_time": 0.05}).details
     np.testing.assert_allclose(at_samples.estimation.parameters_std[0, -1], stated, rtol=0.02)
+
+
+@pytest.mark.parametrize(("inputs", "stated"), [({}, True), ({"v": 0.1}, False)])
+def test_noise_of_a_signal_in_psi_has_no_deviation_to_state(inputs, stated):
+    given = {**SINE, "signals": {"s": "sin(t)", "v": "cos(3*t)"}, "psi": [["s", "v"]]}
+    found = run(regression=given, estimator="least_squares", time={"horizon": 5},
+                noise={"name": "gaussian", "outputs": 0.1, "inputs": inputs})
+    assert (found.details.estimation.parameters_std is not None) == stated
 
 
 def test_arrays_by_name_and_what_can_be_checked():

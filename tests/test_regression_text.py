@@ -10,16 +10,18 @@ from processes import refused
 from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
 from gpebo_cli.settings import SolverSettings, TimeSettings
 
 T = np.linspace(0.0, 10.0, 201)
 
 
-def on_mesh(mapping, tol=1e-12):
+def on_mesh(mapping, tol=1e-12, start=0.0):
     model = regression_from_mapping({"name": "r", **mapping})
     solver = SolverSettings(tol=tol)
-    signals = signals_of_time(model.system, model, TimeSettings(horizon=10.0), solver)
+    signals = signals_of_time(model.system, model, TimeSettings(start, 10.0), solver)
     regression, error = model.on(signals[0], None, tol, 100_000)
     assert error <= 1e-10
     return regression
@@ -83,6 +85,37 @@ def test_what_signals_switch_is_as_exact_as_what_time_does(along, of_time):
     np.testing.assert_allclose(found, expected, atol=1e-10)
 
 
+@pytest.mark.parametrize("start", [-7.0, 3.0])
+def test_it_does_not_matter_when_a_run_starts(start):
+    texts = ["integral(sign(u - 0.3))", "lp(sign(lp(u, 2)), 5)", "delay(sign(u), 1.25)*u"]
+    rest = {"unknowns": {"a": 1.0}, "Y": texts, "psi": [["hp(u, 3)"], ["integral(u)"], [1]]}
+    found, expected = (
+        on_mesh({**rest, "signals": {"u": f"sin(t - ({at}))"}}, start=at) for at in (start, 0.0)
+    )
+    assert found.mesh.size == expected.mesh.size
+    inside = T[1:] - 1e-3
+    for part in ("Y", "psi"):
+        np.testing.assert_allclose(
+            getattr(found, part)(inside + start), getattr(expected, part)(inside), atol=1e-10
+        )
+
+
+@pytest.mark.parametrize("step", [1.0, -1.0])
+def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
+    """At an edge of its elements, up or down, while another signal is smooth."""
+    model = regression_from_mapping({
+        "name": "r", "unknowns": {"a": 1.0}, "signals": {"u": None, "v": None},
+        "Y": ["integral(delay(u, 0.35))", "v"], "psi": [[1], [1]],
+    })
+    mesh = initial_mesh(0.0, 10.0, [], 10, radau_rule(9))
+    both = np.stack([np.where(mesh.inside > 3.0, step, 0.0), np.sin(mesh.points)], axis=2)
+    found, _ = model.on(Trajectory(mesh, both), None, 1e-12, 1_000)
+    assert 3.35 in found.mesh.edges
+    assert found.mesh.size < 40
+    expected = np.stack([step * np.maximum(T - 3.35, 0.0), np.sin(T)], axis=1)
+    np.testing.assert_allclose(found.Y(T), expected, atol=1e-10)
+
+
 def test_delays_that_make_too_many_corners_are_refused():
     text = "w"
     for k in range(14):  # 2^14 sums of these
@@ -113,6 +146,7 @@ def test_estimators_find_the_parameters(name):
         "signals": {"u": "1", "y": "4*(1 - exp(-t/2))"},
         "Y": ["hp(y, 3)"], "psi": [["lp(y, 3)", "lp(u, 3)"]],
     })
+    assert np.max(regression.scale) == np.abs(regression.psi.values).max()
     estimator = estimators.build({"name": name})
     found = estimators.estimate(estimator, regression, T).parameters(slice(0, 1))
     np.testing.assert_allclose(found[0, -1], [-0.5, 2.0], atol=1e-5)  # f₀ is in it
@@ -139,6 +173,19 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
 def test_mistakes(change, message):
     with refused(message):
         regression_from_mapping({**GOOD, **change})
+
+
+@pytest.mark.parametrize(("Y", "psi", "measured"), [
+    (["y", "z"], [["u"], [1]], True), (["y", "u"], [[1], [1]], False),
+    (["y", "y"], [[1], [1]], False), (["y", "2*z"], [[1], [1]], False),
+    (["y", "z"], [["y"], [1]], False),
+])
+def test_recorded_signals_that_stand_in_Y_alone_are_outputs(Y, psi, measured):
+    given = {"name": "r", "unknowns": {"a": 1}, "signals": {"y": None, "z": None, "u": "sin(t)"}}
+    found = regression_from_mapping({**given, "Y": Y, "psi": psi})
+    assert found.system.outputs == (tuple(Y) if measured else ())
+    assert found.system.inputs == (("u",) if measured else ("y", "z", "u"))
+    assert (found.Y is None) == measured
 
 
 def test_an_expression_without_a_value_is_named_with_its_time():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +34,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
-from gpebo_cli.regression import dynamics
+from gpebo_cli.regression import dynamics, linear
 from gpebo_cli.regression.dynamics import Dynamics, filtered
 from gpebo_cli.regression.resets import ExtensionState, Reset
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings, TimeSettings
@@ -214,12 +216,23 @@ def test_a_kernel_that_rotates(remedy, estimator):
     assert relative_error(result)[-1] < 1e-9
 
 
+@pytest.mark.parametrize("remedy", ["none", "reset", "output_injection", "current_coordinates"])
+def test_a_kernel_that_rotates_leaves_the_papers_regression_its_outputs(remedy):
+    """Its last r rows are about the outputs; in current coordinates there are further rows."""
+    plant = {**ROTATING, "outputs": list("klmn"), "C": np.eye(4).tolist()}
+    result = run(plant, 5.0, regression="paper", remedy=remedy)
+    assert result.excitation.is_ie
+    assert relative_error(result)[-1] < 1e-6
+    rows = 8 if remedy == "current_coordinates" else 4
+    assert result.regression.psi.shape[1] == rows
+
+
 @pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
 def test_the_regression_holds_in_every_segment(name):
     """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
     system, signals, observation = observed(name, remedy="reset", reset_interval=4.0)
     t = np.linspace(0.0, 20.0, 401)
-    assert len(observation.regression.resets) == 4
+    assert [reset.time for reset in observation.regression.resets] == [4.0, 8.0, 12.0, 16.0]
     assert max(left_of_identities(system, signals, observation, t)) < 1e-9
     eta = observation.truth(t, system.theta_at(t), signals.states)
     for reset in observation.regression.resets:
@@ -235,6 +248,25 @@ def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
     eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
     assert eta[0, 0] == 0.7
     np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
+
+
+@pytest.mark.parametrize("plant", [one_state(A=[[1]]), one_state(
+    states=["a", "b"], E=[[1, 0], [0, 1]], A=[[0.6, 2], [0, 0.3]], C=[[1, 0]], initial_state=[1, 1],
+)], ids=["one", "two"])
+def test_resets_come_at_the_last_edge_before_the_extension_exceeds_a_hundred(plant):
+    """‖Φ‖₂ of Φ = e^{At}, from one reset to the next."""
+    system = plant_from_mapping(plant)
+    signals, found = along(system, 15.0, remedy="reset")
+    times, edges = [0.0], signals.inputs.mesh.edges
+    times += [reset.time for reset in found.regression.resets]
+    assert len(times) > 2
+    for before, time in pairwise(times):
+        after = edges[np.searchsorted(edges, time + 1e-9)]
+        there, too_late = (
+            np.linalg.norm(expm(np.array(plant["A"]) * (t - before)), 2) for t in (time, after)
+        )
+        assert there <= 100.0 * (1.0 + 1e-5)
+        assert too_late > 100.0 * (1.0 - 1e-5)
 
 
 def test_growth_is_that_of_the_longest_segment():
@@ -310,6 +342,31 @@ def with_a_reset_to_the_same():
     plain = make_regression(three, ETA)
     resets = (Reset(float(plain.mesh.edges[30]), np.eye(3), np.zeros(3), 0.0),)
     return plain, type(plain)(plain.Y, plain.psi, plain.parameters, plain.scale, resets)
+
+
+@pytest.mark.parametrize("p", [3, 17])
+@pytest.mark.parametrize("factor", [None, 1.0, 2.0])
+def test_what_is_known_at_the_end_is_that_of_every_time_there(p, factor):
+    """Of many parameters it is made without that of all times, unless there are resets."""
+    made = make_regression(
+        lambda t: np.cos(np.asarray(t)[..., None] * np.arange(1.0, p + 1.0)), np.ones(p)
+    )
+    if factor is not None:
+        at = float(made.mesh.edges[30])
+        made = replace(made, resets=(Reset(at, factor * np.eye(p), np.zeros(p), 0.0),))
+    final = made.gram_final
+    np.testing.assert_allclose(final, made.gram.final, atol=1e-10)
+    np.testing.assert_allclose(made.gram_at(np.array([10.0]))[0], final, atol=1e-10)
+
+
+def test_a_long_regression_with_resets_or_many_seeds_is_taken_as_a_whole(monkeypatch):
+    monkeypatch.setattr(linear, "_WINDOW", 16)
+    plain, cut = with_a_reset_to_the_same()
+    seeds = replace(plain, Y=Trajectory(plain.mesh, plain.Y.values[..., None] * np.ones(2)))
+    assert [len(list(each.windows())) for each in (plain, cut, seeds)] == [5, 1, 1]
+    edges = plain.mesh.edges
+    whole = replace(plain).gram(edges)
+    np.testing.assert_allclose(plain.gram_at(edges), whole, atol=1e-10)
 
 
 def test_windows_of_excitation_run_through_resets():
@@ -398,6 +455,15 @@ def test_filters_in_current_coordinates_hold_the_state():
     zeta = observation.truth(t, np.broadcast_to(system.theta, (201, 1)), signals.states)
     values = both(t)
     residual = np.einsum("mij,mj->mi", values[..., :-1], zeta) - values[..., -1]
+    gram = regression.gram(t[1:])
+    np.testing.assert_allclose(  # rounding is a share of what there is, however little that is
+        regression.rounding_of(1e-9 * gram), 1e-9 * regression.rounding_of(gram), rtol=1e-12
+    )
+    units = np.array([1.0, 10.0, 0.1, 5.0])
+    other = replace(regression, dynamics=replace(regression.dynamics, units=units))
+    largest = (np.einsum("mjj->mj", gram[..., :4]) * units**2).max(axis=1)
+    expected = 1e-12 * np.outer(largest, units**-2)
+    np.testing.assert_allclose(other.rounding_of(gram), expected, rtol=1e-12)
     size = np.linalg.norm(values[..., :-1], axis=(1, 2)) * np.linalg.norm(zeta, axis=1)
     assert (np.abs(residual).max(axis=1) <= 1e-10 * size.max()).all()
     expected = (*system.unknowns, "w_x1", "w_x2", "w_x3")
@@ -625,6 +691,29 @@ def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):
     monkeypatch.setattr("gpebo_cli.observers._riccati._FALL", 0.0)
     with pytest.raises(SolverError, match=r"a double; give the gain, observer\.injection, or"):
         run(GROWING, 1.0, remedy="output_injection")
+
+
+@np.errstate(all="ignore")
+def test_filters_forget_twice_as_fast_as_what_has_decayed_fastest_so_far():
+    """In levels of which 96 are a decade; decays, once a hundredth of their time has passed."""
+    mesh = initial_mesh(0.0, 4.0, [], 40, radau_rule(9))
+    t = mesh.points
+    rows = np.zeros((*t.shape, 2, 3))
+    rows[..., 0, 0], rows[..., 1, 1] = 0.5 * np.cos(t), np.sin(1.5 * t) * (1.0 + t)
+    moves = Dynamics(Trajectory(mesh, rows), np.ones(2))
+    at = np.linspace(0.01, 3.99, 200)
+    decay = -np.minimum(0.5 * np.cos(at), np.sin(1.5 * at) * (1.0 + at))
+    fastest = np.maximum.accumulate(np.where(decay * at > 0.01, decay, 0.0))
+    times, levels = moves.forgetting
+    found = 0.5 * levels[np.searchsorted(times, at)]
+    step, some = 10.0 ** (1.0 / 96.0), fastest > 0.0
+    assert not found[~some].any()
+    assert (found[some] >= fastest[some]).all()
+    before = np.maximum.accumulate(np.append(fastest[1:], fastest[-1]))  # between two times
+    assert (found[some] <= step * before[some]).all()
+    rises = np.maximum(np.maximum(0.5 * np.cos(t), np.sin(1.5 * t) * (1.0 + t)), 0.0)
+    expected = Trajectory(mesh, rises).integral().final
+    assert moves.growth == pytest.approx(expected, rel=1e-12)
 
 
 def test_filters_that_forget_fast_take_more_stages_than_a_recording_has():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -167,6 +167,20 @@ def test_result_does_not_depend_on_the_restarts():
     assert np.abs(x - y).max() < 1e-9 * np.abs(y).max()
 
 
+def test_the_error_estimate_is_of_the_estimate_where_the_covariance_rests():
+    """P = 1 solves −2P + 3 − P² = 0; ζ̂' = −2ζ̂ + sin 40t is resolved roughly."""
+    one = np.ones((1, 1))
+    case = constant(-one, one, 3.0 * one, one, 0.0 * one)
+    case = replace(case, z=lambda t: np.array([np.sin(40.0 * t)]))
+    rough = case.filtered(np.zeros(1), one, 10.0, tol=1e-2)
+    t = np.unique(rough.mesh.points)
+    P, x = rough.at(t)
+    np.testing.assert_allclose(P, 1.0, rtol=1e-12)
+    exact = (2.0 * np.sin(40.0 * t) - 40.0 * np.cos(40.0 * t) + 40.0 * np.exp(-2.0 * t)) / 1604.0
+    wrong = np.abs(x[:, 0, 0] - exact).max() / np.abs(exact).max()
+    assert 0.1 < rough.error_estimate / wrong < 10.0
+
+
 def test_many_elements_take_few_stages_and_lose_nothing():
     """Where samples have made elements short, a high order would be paid for nothing."""
     case, start, P0, t = varying(), np.zeros(3), 10.0 * np.eye(3), np.linspace(0.5, 20.0, 40)
@@ -235,7 +249,7 @@ def test_pair_and_quotient_are_inverse():
 
 
 @pytest.mark.parametrize(("variance", "message"), [
-    (1e6, "beyond the digits of a double; give a gain"),
+    (1e6, r"fall to 5\.[45]e-20 of .* beyond the digits of a double; give a gain"),
     (1e-2, "may fall too fast from where it starts: give a gain"),
 ])
 def test_a_covariance_that_cannot_be_resolved_is_refused_with_what_to_change(variance, message):
@@ -268,8 +282,24 @@ def test_a_covariance_that_becomes_indefinite_is_refused():
     case = constant(none, np.zeros((1, 2)), -0.5 * np.eye(2), one, np.zeros((2, 1)))
     P, _ = case.filtered(np.zeros(2), np.eye(2), 1.5).at(np.ones(1))
     np.testing.assert_allclose(P[0], 0.5 * np.eye(2), atol=1e-14)
-    with pytest.raises(SolverError, match=r"semidefinite near t = 2\.00\d* .*lower observer\.P0"):
+    near, told = r"semidefinite near t = 2\.00\d*", r"-5\.0e-01 of its trace\); lower observer\.P0"
+    with pytest.raises(SolverError, match=rf"{near} \(eigenvalue {told}"):
         case.filtered(np.zeros(2), np.eye(2), 3.0)
+
+
+def test_window_gramians_are_resolved_in_any_units_of_the_outputs():
+    """x' = 0 seen with W = ε(1 + cos 20t), in elements of one and a half of its periods."""
+    small, window = 1e-9, 2.0
+
+    def model(t: Array, inside: Array) -> tuple[Array, Array]:
+        return np.zeros((1, 1, 1)), small * (1.0 + np.cos(20.0 * t))[:, None, None]
+
+    mesh = initial_mesh(0.0, 20.0, [], 40, radau_rule(5))
+    found = window_gramians(model, 1, mesh, tol=1e-8, max_elements=5000)
+    whole = np.isin(found.starts, mesh.edges)  # there, windows end at edges
+    t, M = found.starts[whole], found.gramians[whole, 0, 0]
+    expected = window + (np.sin(20.0 * (t + window)) - np.sin(20.0 * t)) / 20.0
+    np.testing.assert_allclose(M / small, expected, rtol=1e-8)
 
 
 @pytest.mark.parametrize("stages", [12, 3])

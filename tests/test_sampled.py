@@ -15,6 +15,7 @@ from plants import experiment, shipped
 from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
+from test_remedies import MIXED
 
 import gpebo_cli
 from gpebo_cli import estimators
@@ -30,6 +31,7 @@ from gpebo_cli.estimators._recursive import (
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.observers import build
 from gpebo_cli.regression.linear import outer_products
 from gpebo_cli.regression.samples import SampledRegression, delayed
 from gpebo_cli.regression.text import regression_from_mapping
@@ -202,8 +204,10 @@ def test_it_does_not_matter_how_samples_are_grouped():
     able = ("fct", "power", "exciting", "gradient", "mre", "instrumental", "annihilator")
     for name in ("ls_drem", "least_squares", "drem", *able):
         settings = Settings(estimator={"name": name})
-        whole = Online(settings, system, "linear", t[0], np.append(u[0], y[0])).feed(t, u, y)
-        parts = Online(settings, system, "linear", t[0], np.append(u[0], y[0]))
+        at_once, parts = (
+            Online(settings, system, "linear", t[0], np.append(u[0], y[0])) for _ in range(2)
+        )
+        whole = at_once.feed(t, u, y)
         cuts = [0, 1, 2, 9, 40, 60]
         made = [
             parts.feed(t[a:b], u[a:b], y[a:b]) for a, b in pairwise(cuts)
@@ -211,6 +215,40 @@ def test_it_does_not_matter_how_samples_are_grouped():
         for field in ("parameters", "states"):
             joined = np.concatenate([getattr(part, field) for part in made], axis=1)
             np.testing.assert_allclose(joined, getattr(whole, field), rtol=1e-8, atol=1e-9)
+        for field in ("growth", "growth_rate"):
+            assert getattr(parts, field) == pytest.approx(getattr(at_once, field), rel=1e-6)
+        assert parts.assumptions == at_once.assumptions
+
+
+@pytest.mark.parametrize("name", ["descriptor", "rotating", "mixed"])
+def test_blocks_of_an_observer_may_be_of_any_size(name):
+    """All that is handed on from one to the next: times, rows, sizes, growth, errors."""
+    plants = {"rotating": ROTATING, "mixed": MIXED}
+    system = plant_from_mapping(plants[name]) if name in plants else shipped(name)
+    t = np.cumsum(np.random.default_rng(2).uniform(0.05, 0.5, 30))
+    u, y = signals(system, t)
+    made = build({"name": "gpebo"}).at_samples(
+        system, SolverSettings(), "linear", t[0], np.append(u[0], y[0]), None
+    ).responding(np.arange(system.m + system.r) >= system.m)
+    at_once, whole = made.advance(None, t, u, y)
+    state, errors = None, []
+    for part in (slice(0, 1), slice(1, 4), slice(4, 29), slice(29, 30)):
+        state, block = made.advance(state, t[part], u[part], y[part])
+        errors.append(state.error_estimate)
+        rows = whole.regression.rows[part.start : part.stop + 1]
+        np.testing.assert_allclose(block.regression.rows, rows, rtol=1e-6, atol=1e-8)
+        for field in ("t", "steps", "scale"):
+            ours, theirs = (getattr(b.regression, field) for b in (block, whole))
+            np.testing.assert_allclose(ours, theirs[part], rtol=1e-6, atol=1e-12)
+        for field in ("offset", "gain", "extension"):
+            theirs = getattr(whole, field)[part]
+            np.testing.assert_allclose(getattr(block, field), theirs, rtol=1e-6, atol=1e-7)
+        for ours, theirs in zip(block.errors, whole.errors, strict=True):
+            np.testing.assert_allclose(ours, theirs[part], rtol=1e-6, atol=1e-7)
+    for field in ("growth", "log_norm", "injectivity"):
+        assert getattr(state, field) == pytest.approx(getattr(at_once, field), rel=1e-6)
+    assert 0.0 < max(errors) == errors[-1]
+    assert errors == sorted(errors)
 
 
 def test_every_case_is_what_it_is_alone():
@@ -782,5 +820,8 @@ def test_what_is_delayed_lies_between_samples_as_the_hold_has_it(hold, between):
     first = np.array([0.0]), np.array([[0.0]])
     found, past = delayed(first, np.array([1.0]), np.array([[3.0]]), 0.75, hold)
     assert found == pytest.approx(np.array([[between]]))
-    again, _ = delayed(past, np.array([2.0]), np.array([[6.0]]), 0.75, hold)
+    again, past = delayed(past, np.array([2.0]), np.array([[6.0]]), 0.75, hold)
     assert again == pytest.approx(np.array([[3.0 * 1.25 if hold == "linear" else 3.0]]))
+    for t in np.arange(3.0, 50.0):  # what is kept is no longer than the delay and a step
+        _, past = delayed(past, np.array([t]), np.array([[3.0 * t]]), 0.75, hold)
+        assert past[0].tolist() == [t - 1.0, t]

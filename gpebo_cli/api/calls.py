@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, cast, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
@@ -261,16 +261,10 @@ def _shipped(name: str) -> DescriptorSystem:
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
     """``data`` as the group has it: a path, a frame, arrays by name, or a mapping with one."""
     if isinstance(data, Mapping):
-        if "t" in data:
-            from pandas import DataFrame  # a third of a second to import
-
-            try:
-                return {"name": "csv", "frame": DataFrame(dict(data))}
-            except ValueError as error:
-                columns = cast("Mapping[str, Any]", data).items()
-                sizes = ", ".join(f"{name} {np.shape(column)}" for name, column in columns)
-                raise ConfigError(f"data: arrays of the shapes {sizes}: {error}") from error
-        return {"name": "csv", **data}
+        given: dict[str, object] = {"frame": data} if "t" in data else dict(data)
+        if isinstance(frame := given.get("frame"), Mapping):
+            given["frame"] = _framed(frame)
+        return {"name": "csv", **given}
     if data is None or (isinstance(data, str) and data == "none"):
         return data
     if isinstance(data, list):
@@ -278,6 +272,23 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
     if not isinstance(data, str | os.PathLike):
         return {"name": "csv", "frame": data}
     return {"name": "csv", "file": os.fspath(data)}
+
+
+def _framed(columns: Mapping[str, Any]) -> DataFrame:
+    """Arrays by name as a frame (ConfigError: something else is among them, or lengths differ)."""
+    from pandas import DataFrame  # a third of a second to import
+
+    for name, column in columns.items():
+        if isinstance(column, str | Mapping):
+            raise ConfigError(
+                f"data: {shown(name)} is no array; how rows are read stands beside all of them, as "
+                'in data={"frame": {"t": …, …}, "hold": "zoh"}'
+            )
+    try:
+        return DataFrame(dict(columns))
+    except ValueError as error:
+        sizes = ", ".join(f"{name} {np.shape(column)}" for name, column in columns.items())
+        raise ConfigError(f"data: arrays of the shapes {sizes}: {error}") from error
 
 
 def _check_gains(gains: Mapping[str, object], estimator: Mapping[str, object]) -> None:

@@ -213,7 +213,7 @@ def run_filter(
         raise SolverError(
             f"{error}; the covariance may fall too fast from where it starts: {advice}"
         ) from error
-    size = np.maximum(np.einsum("kjii->kj", P), np.finfo(float).tiny)
+    size = np.maximum(np.abs(np.einsum("kjii->kji", P)).sum(axis=2), np.finfo(float).tiny)
     relative = np.linalg.eigvalsh(P)[..., 0] / size
     if relative.min() < -_INDEFINITE:
         t = solution.trajectory.mesh.points.flat[np.argmax(relative < -_INDEFINITE)]

@@ -86,10 +86,10 @@ class CurrentCoordinates:
             a = regression_signals(z, q, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
-                # Further rows 0 = Q w, of the size of ψ.
+                # Further rows 0 = Q w, of the size of ψ; those of the outputs remain the last ones.
                 kernel = size / reduced.units[:, None] * (np.eye(n) - o.split.projector)
                 more = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
-                a = replace(a, Y=np.pad(a.Y, ((0, 0), (0, n))), psi=np.hstack([a.psi, more]))
+                a = replace(a, Y=np.pad(a.Y, ((0, 0), (n, 0))), psi=np.hstack([more, a.psi]))
             own = rows * np.append(units, 1.0) / units[q:, None]
             kinds = (*a.kinds(reduced.form.units.states), (own[..., :p], 0.0), (own[..., p], 0.0))
             seen = [(v.reshape(*times.shape[1:], prod(v.shape[1:])), floor) for v, floor in kinds]
@@ -117,8 +117,7 @@ class CurrentCoordinates:
         found = joined(kept_of(parts(), reduced.mesh, reduced.signals.asked))
         kept = found.assembled.kept_rows(system, reduced.regression)
         if rotates:
-            rows = found.assembled.Y.shape[1]
-            kept = np.union1d(kept, np.arange(rows - n, rows))
+            kept = np.union1d(np.arange(n), kept)
         return Observation(
             regression=LinearRegression(
                 *found.rows(kept), parameters=(*system.unknowns, *reduced.labels),

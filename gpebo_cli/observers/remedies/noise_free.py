@@ -87,7 +87,7 @@ def _change(found: Observation, before: Array, after: Array, tol: float) -> floa
     """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981)."""
     Y, psi = found.regression.Y.values, found.regression.psi.values
     residual = Y - psi @ after
-    floor = tol * float(np.abs(Y).max(initial=0.0) + np.abs(psi @ after).max(initial=0.0))
+    floor = tol * float(np.abs(Y).max() + np.abs(psi @ after).max())
     return float(np.linalg.norm(psi @ (after - before)) / (
         np.linalg.norm(residual) + floor / _STILL * np.sqrt(residual.size)
     ))
