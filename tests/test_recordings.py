@@ -205,7 +205,7 @@ def stepped():
 def test_each_signal_may_have_its_own_hold():
     """x is lines where u is held, whatever the steps: k and drift come out to rounding."""
     for hold, right in ({"u": "zoh"}, True), ("linear", False), ("zoh", False):
-        found = run(STEPPED, data={"frame": pd.DataFrame(stepped()), "hold": hold},
+        found = run(STEPPED, data={"frame": stepped(), "hold": hold},
                     estimator={"name": "least_squares", "f0": None})
         away = np.abs(found.details.estimation.parameters[0, -1, :2] - [2.5, 0.4]).max()
         assert away < 1e-11 if right else away > 1e-4
