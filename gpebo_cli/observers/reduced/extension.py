@@ -155,8 +155,9 @@ class _Monitor:
                 for before, own in zip(self._past, self._whole, strict=True)
             ]
         z, *seen = map(_over_time, self._whole)
+        equations = AlgebraicEquations(*seen)
         self.latest = regression_signals(
-            z, self._reduced.system.q, self._reduced.basis, AlgebraicEquations(*seen)
+            z, self._reduced.system.q, self._reduced.basis, equations
         )
         if (self.latest.largest / self.units).max(initial=0.0) > _LARGEST:
             raise SolverError(
@@ -167,7 +168,8 @@ class _Monitor:
         reduced, rounding = self._reduced, self._reduced.first.rounding
         if rounding is not None:
             rounding = ROUNDING * EPS / reduced.solver.tol * rounding
-        for signal, floor in self.latest.kinds(reduced.form.units.states, self.axes, rounding):
+        kinds = self.latest.kinds(reduced.form.units.states, self.axes, rounding, equations)
+        for signal, floor in kinds:
             if signal is not None:
                 yield signal.reshape(*self._whole[0].shape[:2], -1), floor
             else:

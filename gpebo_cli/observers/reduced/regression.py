@@ -36,11 +36,10 @@ class Assembled:
     eliminated: BoolArray  # (n,) states that take part in what is eliminated
     largest: Array  # (k, 1 + p) sizes of z over time
     moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
-    terms: Callable[[], Array]  # (n, p) of all that the gain is made of
 
     def kinds(
         self, units: Array | float = 1.0, basis: Array | None = None,
-        rounding: Array | None = None,
+        rounding: Array | None = None, equations: AlgebraicEquations | None = None,
     ) -> Iterator[tuple[Any, Any]]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
@@ -48,7 +47,8 @@ class Assembled:
         because all of a long recording take much memory.
         States that are coordinates of z along a ``basis`` of axes are not copied: instead of their
         gain None comes, with the units (k, p) that z without ξ_a is to be measured in. What
-        ``rounding`` (n, n) of w leaves of a state is no signal to resolve.
+        ``rounding`` (n, n) of w leaves of a state is no signal to resolve, nor is what is left of
+        a state whose terms cancel, those of the ``equations`` that all of this comes from.
         """
         columns = self._columns
         rows, Y, psi = self._rows, self.Y, self.psi
@@ -70,11 +70,10 @@ class Assembled:
         if rounding is not None:
             states = np.maximum(states, self._through(rounding))
         beside = states / units
-        if beside.min(initial=np.inf) < _LITTLE * beside.max(initial=0.0):
-            # What is rounding of its terms, or of other states, is no signal either.
+        if equations and beside.min(initial=np.inf) < _LITTLE * beside.max(initial=0.0):
             each = np.broadcast_to(units, len(states))[:, None]
             others_leave = 64 * EPS * each * (largest / each).max(axis=0)
-            nothing = largest <= np.maximum(_NOISE * self.terms(), others_leave)
+            nothing = largest <= np.maximum(_NOISE * self._terms(equations), others_leave)
             states[nothing.all(axis=1)] = np.inf
         yield Y, 1e-3 * self.Y_scale
         yield psi, 1e-3
@@ -91,6 +90,13 @@ class Assembled:
     def _columns(self) -> Array:
         """Sizes of the columns of ψ (p,), 1 for those that vanish."""
         return np.where(self.column_scale > 0.0, self.column_scale, 1.0)
+
+    def _terms(self, equations: AlgebraicEquations) -> Array:
+        """Sizes (n, p) of all that the gain is made of."""
+        on_basis, _, G, Q1, H, _ = map(largest_over_time, equations)
+        seen = on_basis @ self.largest[:, 1:]
+        seen[:, : G.shape[1]] += G
+        return np.asarray(self.moving + H @ (Q1.T @ seen))
 
     def _through(self, rounding: Array) -> Array:
         """What ``rounding`` (n, n) of w leaves of each state (n,), with columns of size 1."""
@@ -144,15 +150,7 @@ def regression_signals(
         psi = np.where(nothing, 0.0, psi)
     largest, used = largest_over_time(z), np.asarray(largest_over_time(H).any(axis=1))
     moving = np.abs(basis) @ largest[:, 1:]
-
-    def terms() -> Array:
-        seen = largest_over_time(algebraic) @ largest[:, 1:]
-        seen[:, :q] += largest_over_time(G)
-        return moving + largest_over_time(H) @ (largest_over_time(Q1).T @ seen)
-
-    return Assembled(
-        Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving, terms
-    )
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
 
 
 def resolve(found: Assembled, some: slice, terms: Array, form: EquationForm) -> None:
