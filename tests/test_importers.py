@@ -154,7 +154,7 @@ def ladder(cells, more=""):
     return "\n".join([*lines, more, ""])
 
 
-@pytest.mark.parametrize("cells", [3, 20, 66])
+@pytest.mark.parametrize("cells", [3, 20, 36])
 def test_a_ladder_of_coils_and_capacitors(cells):
     """Against the matrix exponential of its state equations, with currents first."""
     result = simulated(plant_of(ladder(cells), measure="v(n3)"), 5.0)
