@@ -27,6 +27,7 @@ from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
+from gpebo_cli.findings import would_do
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.dynamics import Dynamics
@@ -1083,3 +1084,17 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
+
+
+def test_a_gain_that_would_do_is_named_where_the_one_in_use_is_less():
+    assert would_do(4.0, 4.0) == would_do(5.0, 4.0) == ""
+    assert would_do(3.0, 4.0) == ": γ ≥ 4"
+    assert would_do(3.0, np.inf) == ": no γ would do"
+
+
+def test_persistent_excitation_is_asked_of_the_smallest_gain():
+    alone, beside = (
+        estimate("gradient", CLEAN, gamma=gamma).requirement for gamma in (0.5, [3.0, 0.5, 8.0])
+    )
+    assert beside == alone
+    assert beside != estimate("gradient", CLEAN, gamma=8.0).requirement

@@ -433,7 +433,10 @@ SLIDER_CRANK = {  # linearised about a slow turn: two positions on a line that a
 
 def test_mechanics_of_index_3():
     """Both masses move as one; the force in the rod is what is left of a balance."""
-    result = simulated(from_mechanics(SLIDER_CRANK, "rod").mapping())
+    draft = from_mechanics(SLIDER_CRANK, "rod")
+    assert draft.title == "mechanism rod"
+    assert from_mechanics({**SLIDER_CRANK, "title": "a rod"}, "rod").title == "a rod"
+    result = simulated(draft.mapping())
     assert result.details.simulation.index == 3
 
     def slope(t, z):

@@ -17,6 +17,7 @@ from gpebo_cli.numerics.linalg import (
     determinant_and_inverse,
     inverse_or_none,
     largest_over_time,
+    products_of_others,
 )
 from gpebo_cli.reduction.scaling import _first_of_each_part
 
@@ -102,3 +103,10 @@ def test_rows_that_columns_link_in_long_chains_are_one_part(seed, count):
     parts = [sorted(rows[:count].tolist()), *([row] for row in rows[count:].tolist())]
     first = {row: min(part, key=order.tolist().index) for part in parts for row in part}
     assert _first_of_each_part(linked, order).tolist() == [first[row] for row in range(9)]
+
+
+def test_products_of_others_are_those_without_one():
+    factors = np.random.default_rng(3).normal(size=(2, 3, 5))
+    found = products_of_others(factors)
+    for i in range(5):
+        np.testing.assert_allclose(found[..., i], np.delete(factors, i, axis=-1).prod(axis=-1))

@@ -1067,3 +1067,15 @@ def test_errors_on_lines_have_the_steps_on_both_sides():
     # At both ends there is no further step: that beside it counts once more.
     assert rows.intensities(t) == pytest.approx([1.25, 0.25 * (1.0 + 2.0 * 2.0 + 4.0), 3.5, 3.5])
     assert rows._replace(hold="zoh").intensities(t) == pytest.approx([1.0, 2.0, 4.0, 4.0])
+
+
+def test_a_folder_and_too_many_cells_are_no_recording(tmp_path, monkeypatch):
+    with pytest.raises(ConfigError, match="is a folder, not a file"):
+        run("circuit", data=tmp_path)
+    if not find_spec("pyarrow"):
+        return
+    frame = pd.DataFrame(stepped())
+    frame.to_parquet(tmp_path / "a.parquet")
+    monkeypatch.setattr("gpebo_cli.recordings.table._MOST_CELLS", frame.size - 1)
+    with pytest.raises(ConfigError, match=f"has {frame.size} cells; at most {frame.size - 1} are"):
+        run(STEPPED, data=tmp_path / "a.parquet")
