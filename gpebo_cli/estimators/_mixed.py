@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import GainEstimator, ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._recursive import KreisselmeierFilter, Mixed, ScalarLaw, mix_sampled
-from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, resolved, scalar_law
+from gpebo_cli.estimators._scalar import ScalarPath, kreisselmeier, mix, resolved_for, scalar_law
 from gpebo_cli.evidence.metrics import DECAY
 from gpebo_cli.findings import Requirement, would_do
 from gpebo_cli.model.descriptor import Array
@@ -288,7 +288,7 @@ def mixed_estimates(
 ) -> MixedEstimates:
     """The estimates with the gains γ of some settings, of mixed regressions."""
     names, gains = regression.parameters, settings.gains("gamma", regression.parameters)
-    groups = tuple(resolved(path, gains) for path in groups)
+    groups = tuple(resolved_for(path, gains) for path in groups)
     return MixedEstimates(
         groups, settings.start(names), gains, condition, at_end,
         realisations=regression.realisations, known=known, units=regression.units,

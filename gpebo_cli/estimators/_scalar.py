@@ -16,12 +16,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, reciprocals
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, legendre_tail, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
-from gpebo_cli.regression.linear import LinearRegression, with_realisations
+from gpebo_cli.regression.linear import (
+    LinearRegression,
+    refuse_overflow,
+    with_realisations,
+)
 
 Pace = Callable[[Array], Array]  # times (N,) -> what γ is multiplied by there (N,)
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)
@@ -350,7 +353,7 @@ def scalar_path(
     )
 
 
-def resolved(path: ScalarPath, gains: Array) -> ScalarPath:
+def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
     """The path with elements within which e^{−γI} is known, for all of the gains (g, 1 or p).
 
     Δ may grow by orders of magnitude within an element that resolves Ω, and what a large gain
@@ -391,7 +394,7 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     beyond what a number can be; names the time).
     """
     p, mesh = extended.values.shape[-2], extended.mesh
-    _refuse_overflow("Ω, which is made of squares of ψ,", mesh, extended.values)
+    refuse_overflow("Ω, which is made of squares of ψ,", mesh, extended.values)
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
@@ -403,22 +406,11 @@ def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     digits = reciprocals(condition, usable)
-    _refuse_overflow("Δ² of Δ = det(Ω)", mesh, delta.reshape(*points, 1, 1) ** 2)
+    refuse_overflow("Δ² of Δ = det(Ω)", mesh, delta.reshape(points) ** 2)
     return scalar_path(
         mesh, signals, delta.reshape(points), digits.reshape(points),
         filled(quotient.reshape(*points, -1), usable), t, floor,
     )
-
-
-def _refuse_overflow(what: str, mesh: Mesh, values: Array) -> None:
-    """SolverError if ``what`` has values (K, s + 1, …) that are beyond what a number can be."""
-    finite = np.isfinite(values)
-    if not finite.all():
-        first = int(np.argmin(finite.all(axis=(1, 2, 3))))
-        raise SolverError(
-            f"{what} is too large for a number near t = {mesh.edges[first]:.4g}; write Y and ψ in "
-            "larger units"
-        )
 
 
 def filled(quotient: Array, usable: BoolArray) -> Array:

@@ -26,7 +26,7 @@ import numpy as np
 from gpebo_cli.estimators._base import WindowedEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
 from gpebo_cli.estimators._recursive import Mixed, Steps
-from gpebo_cli.estimators._scalar import ScalarPath, filled, resolved, scalar_path
+from gpebo_cli.estimators._scalar import ScalarPath, filled, resolved_for, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
@@ -60,7 +60,7 @@ class Exciting(WindowedEstimator):
     def go_on(self, regression: LinearRegression, t: Array, known: Known) -> MixedEstimates:
         """Extend, mix, rotate, and keep what the closed form needs at the times t (M,)."""
         inner = self.part(Drem).resume(regression, t, known)
-        path = resolved(inner.groups[0], np.array([[self.kappa]]))
+        path = resolved_for(inner.groups[0], np.array([[self.kappa]]))
         columns, left = 1 + path.quotient.shape[-1], self._left(path, known)
 
         def rotation(t: Array, inside: Array) -> LinearEquation:
@@ -90,7 +90,7 @@ class Exciting(WindowedEstimator):
         law = scalar_path(found.mesh, signals, new, new, quotient, t, path.floor)
         (end,) = inner.at_end()
         end = replace(end, turned=found.final)
-        law = resolved(law, inner.gains)
+        law = resolved_for(law, inner.gains)
         return replace(inner, groups=(law,), condition="IE", at_end=lambda: (end,))
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:

@@ -131,13 +131,7 @@ class LinearRegression:
                 part = window.gram  # what it holds is its own
                 np.add(part.values, known, out=part.values)
                 known = part.final
-            finite = np.isfinite(part.values[:, -1]).all(axis=(1, 2))
-            if not finite.all():
-                t = part.mesh.edges[np.argmin(finite)]
-                raise SolverError(
-                    f"∫ψᵀψ is too large for a number near t = {t:.4g}; write Y and ψ in larger "
-                    "units"
-                )
+            refuse_overflow("∫ψᵀψ", part.mesh, part.values[:, -1])
             yield part
         vars(self).setdefault("gram_final", part.final)
 
@@ -281,6 +275,16 @@ def least_squares(root: Array) -> Array:
     size = np.where(size > 0.0, size, 1.0)
     inverse = np.linalg.pinv(root[..., :-1] / size[..., None, :], rcond=_SINGULAR)
     return np.asarray((inverse @ root[..., -1:])[..., 0] / size)
+
+
+def refuse_overflow(what: str, mesh: Mesh, values: Array) -> None:
+    """SolverError if ``what`` is not finite in an element, from its values (K, …); names the time."""
+    finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+    if not finite.all():
+        raise SolverError(
+            f"{what} is too large for a number near t = {mesh.edges[np.argmin(finite)]:.4g}; write "
+            "Y and ψ in larger units"
+        )
 
 
 def outer_products(psi: Array, Y: Array) -> Array:
