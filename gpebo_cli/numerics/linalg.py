@@ -32,6 +32,11 @@ def without_rounding(found: Array, terms: Array | None = None) -> Array:
     return found
 
 
+def less_product(own: Array, factor: Array, other: Array) -> Array:
+    """``own`` − ``factor`` @ ``other`` (N, i, j), :func:`without_rounding` of their terms."""
+    return without_rounding(own - factor @ other, np.abs(own) + np.abs(factor) @ np.abs(other))
+
+
 def transpose(a: Array) -> Array:
     """Of the last two axes, (…, a, b) to (…, b, a)."""
     return np.swapaxes(a, -1, -2)

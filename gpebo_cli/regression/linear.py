@@ -278,7 +278,7 @@ def least_squares(root: Array) -> Array:
 
 
 def refuse_overflow(what: str, mesh: Mesh, values: Array) -> None:
-    """SolverError if ``what`` is not finite in an element, from its values (K, …); names the time."""
+    """SolverError if ``what``, of values (K, …) in elements, is not finite; names the time."""
     finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
     if not finite.all():
         raise SolverError(

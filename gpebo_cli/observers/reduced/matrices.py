@@ -15,6 +15,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import (
     exact_product,
     largest_over_time,
+    less_product,
     orthonormal_complement,
     symmetric_eigenvalues,
     transpose,
@@ -132,15 +133,10 @@ class ObserverMatrices:
         The gain must be N = N R with columns in range P: R (𝒜 w + g_y + G θ) = 0 is all that w
         has to fulfil, and w must stay in range P.
         """
-        def less(own: Array, seen: Array) -> Array:
-            return without_rounding(
-                own - gain @ seen, np.abs(own) + np.abs(gain) @ np.abs(seen)
-            )
-
         return replace(
-            self, dynamics=less(self.dynamics, self.on_basis),
-            from_unknowns=less(self.from_unknowns, self.G),
-            from_signals=less(self.from_signals, self.g_signals),
+            self, dynamics=less_product(self.dynamics, gain, self.on_basis),
+            from_unknowns=less_product(self.from_unknowns, gain, self.G),
+            from_signals=less_product(self.from_signals, gain, self.g_signals),
         )
 
 
@@ -287,10 +283,7 @@ def _moving(
         return direct
     back, found = back[:, moved], list[Array]()
     for own, seen in zip(direct, equations, strict=True):
-        through, before = transpose(Q1) @ seen, own[:, moved]
-        after = without_rounding(
-            before - back @ through, np.abs(before) + np.abs(back) @ np.abs(through)
-        )
+        after = less_product(own[:, moved], back, transpose(Q1) @ seen)
         found.append(np.array(np.broadcast_to(own, (len(after), *own.shape[1:]))))
         found[-1][:, moved] = after
     return found
@@ -324,11 +317,11 @@ def _seen_through(
     output takes part in the elimination, and the regression has all of them.
     """
     through = C @ kernel @ np.linalg.pinv(hidden.states @ kernel)
-    left = [
-        without_rounding(part - through @ more, np.abs(part) + np.abs(through) @ np.abs(more))
+    of_x, of_v, of_theta = (
+        less_product(part, through, more)
         for part, more in zip((C, D, H), hidden[:3], strict=True)
-    ]
-    return left[0], left[1], left[2]
+    )
+    return of_x, of_v, of_theta
 
 
 def _eliminate(
