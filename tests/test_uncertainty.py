@@ -533,6 +533,21 @@ def test_errors_with_resets_are_of_the_size_that_is_said(estimator):
     assert size.max() < 2.2
 
 
+def test_a_reset_moves_the_start_of_the_finite_time_law_and_what_it_takes_out_of_it():
+    """γ is so small that η̂_f stays at its start: (η̂ − w_c η̂(0))/(1 − w_c), both of one error."""
+    moved = []
+    for k in range(12):
+        e = run("descriptor", estimator="fct", gamma=1e3, solver={"tol": 1e-5},
+                observer={"name": "gpebo", "remedy": "reset", "reset_times": [2.5]},
+                noise={**NOISE, "seed": k}, time={"horizon": 4, "samples": 9}).details.estimation
+        errors, said = (e.parameters[0] - e.true_parameters)[5:, 2:], e.parameters_std[0, 5:, 2:]
+        assert (np.abs(np.diff(errors, axis=0)) < 1e-3 * said[1:]).all()
+        moved.append(errors)
+    spread = np.std(moved, axis=0, ddof=1) / said
+    assert spread.min() > 0.5
+    assert spread.max() < 1.6
+
+
 @pytest.mark.parametrize(("name", "gains"), [
     ("drem", {"gamma": [1e13, 5e13]}), ("ls_drem", {"gamma": [2.0, 10.0], "f0": 1e-2}),
 ])

@@ -14,7 +14,7 @@ from gpebo_cli.estimators._registry import Several, SeveralEstimates, able
 from gpebo_cli.evidence.uncertainty import after_reset
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.regression.errors import ErrorsAt, one_after_another
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem, one_after_another
 from gpebo_cli.regression.estimator import (
     Affine,
     Estimates,
@@ -156,13 +156,26 @@ def errors(
         return estimator.errors(part, known[k])  # type: ignore[call-arg]
 
     def of_case(g: int) -> tuple[ErrorsAt, Sequence[tuple[float, Array]]]:
+        if not regression.resets:
+            return one_after_another(starts, lambda k, t, inside: of_part(k)[g](t, inside)), ()
+        meshes = [segment.mesh for segment in regression.segments]
+        at_ends = [
+            of_part(k)[g](mesh.edges[-1:], mesh.inside[-1, -1:]) for k, mesh in enumerate(meshes)
+        ]
+        # After a reset a law may keep where it started, too.
+        more = at_ends[-1].C.shape[2] - at_ends[0].C.shape[2]
+        others = np.zeros((1, regression.p, more))
+
+        def at(k: int, t: Array, inside: Array) -> ErrorSystem:
+            system = of_part(k)[g](t, inside)
+            return system if k else system.with_constants(others)
+
+        at_ends[0] = at_ends[0].with_constants(others)
         turns = []
-        for k, reset in enumerate(regression.resets):
-            mesh, own = regression.segments[k].mesh, ends[k]
-            system = of_part(k)[g](mesh.edges[-1:], mesh.inside[-1, -1:])
+        for reset, system, own in zip(regression.resets, at_ends, ends, strict=False):
             state = own[g * len(own) // len(estimator.cases)] if own else None
             turns.append((reset.time, after_reset(system, reset, state)))
-        return one_after_another(starts, lambda k, t, inside: of_part(k)[g](t, inside)), turns
+        return one_after_another(starts, at), turns
 
     return [of_case(g) for g in range(len(estimator.cases))]
 

@@ -58,7 +58,7 @@ class FiniteTime(ResumableEstimator):
         return self.inner.axes()
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
-        """δη̂_f = δη̂/(1 − w_c), of every case."""
+        """δη̂_f = (δη̂ − w_c δη̂(0))/(1 − w_c), of every case; δη̂(0) is zero before any reset."""
         inner = self.inner.resume(regression, regression.mesh.edges[-1:], known)
         mu, gains = float(self.mu), inner.gains
 
@@ -68,6 +68,8 @@ class FiniteTime(ResumableEstimator):
             energy = before + np.maximum(path.mesh.sampler(t, inside)(path.energy), 0.0)
             w_c = np.minimum(np.exp(-energy[:, None] * gain), 1.0 - mu)
             found = errors(t, inside)
+            if known and regression.whole is None:  # the start is an estimate
+                found = found.with_constants(-w_c[..., None] * np.eye(regression.p))
             return found._replace(C=found.C / (1.0 - w_c)[..., None])
 
         errors = self.inner.errors(regression, known)

@@ -293,9 +293,10 @@ def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None)
     if known is not None:
         J[:p, zeta : zeta + p] = known.carries(reset)
         J[:p, :zeta] = -known.after(reset).values[:, :p] @ V
-    if known is None or own > p:  # the last p of s are δη̂ itself
+    for first in range(0 if known is None else p, own, p):  # the law starts from η̂, and may keep it
         # What is unknown then is forgotten when the data tell more.
-        J[-p:, zeta:], J[-p:, :zeta] = reset.transform @ np.nan_to_num(system.C[0]), -V
+        law = slice(first, first + p)
+        J[law, zeta:], J[law, :zeta] = reset.transform @ np.nan_to_num(system.C[0]), -V
     return J
 
 

@@ -29,6 +29,15 @@ class ErrorSystem(NamedTuple):
     C: Array  # (N, O, S)
     D: Array  # (N, O, I)
 
+    def with_constants(self, C: Array) -> ErrorSystem:
+        """The same with c more s at the end that nothing moves, and C (N or 1, O, c) of these."""
+        more, count = C.shape[2], max(len(self.C), len(C))
+        C = np.concatenate([
+            np.broadcast_to(each, (count, *each.shape[1:])) for each in (self.C, C)
+        ], axis=2)
+        A = np.pad(self.A, ((0, 0), (0, more), (0, more)))
+        return ErrorSystem(A, np.pad(self.B, ((0, 0), (0, more), (0, 0))), C, self.D)
+
 
 # (times (N,), inside (N,)) -> the system there
 ErrorsAt = Callable[[Array, Array], ErrorSystem]
