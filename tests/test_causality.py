@@ -147,3 +147,19 @@ def test_of_a_recording(hold, way):
                observer=observer)
         for count in (20, 60)
     ))
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_at_samples_the_last_row_of_a_recording_is_one_as_any_other(hold):
+    """Nothing is held from it on, but it is there, with an error of its own."""
+    rows = run("descriptor", time={"horizon": 4, "samples": 81}).to_pandas("signals").reset_index()
+    frame = rows[["t", "u", "y"]]
+    one, other = (
+        run("descriptor", data={"frame": frame[:count], "hold": hold},
+            estimator="ls_drem", noise={"name": "gaussian", "outputs": 1e-3},
+            observer={"name": "gpebo", "sample_time": 0.05}).details.estimation
+        for count in (61, 81)
+    )
+    for name in ("parameters", "states", "parameters_std", "states_std"):
+        a, b = (getattr(found, name)[0, 50:61] for found in (one, other))
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-12, err_msg=name)

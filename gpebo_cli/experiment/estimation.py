@@ -238,6 +238,8 @@ def at_samples(
         t = sample_times(samples.step, start, stop)
         check_at_samples(len(estimator.cases), len(t), system)
         u, y = source.inputs(t), source.outputs(t)
+        if source.recording is not None:  # nothing is held from the last row on, but it is a sample
+            u[-1], y[-1] = source.recording.inputs[-1], source.recording.outputs[-1]
 
         def fed(
             by: estimators.Estimator, columns: IntArray | None, *, last: bool

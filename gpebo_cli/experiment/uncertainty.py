@@ -45,7 +45,7 @@ def sampled_deviations(levels: NoiseLevels, source: Source | None) -> SampledDev
         return SampledDeviations(variances, None, relative=levels.silent)
     rows = _rows(source)
     instants = rows.t
-    if not rows.lines:  # nothing is held from the end on
+    if not recorded and not rows.lines:  # noise that is held has no other value at the end
         instants = instants[: np.searchsorted(instants, source.inputs.mesh.edges[-1])]
     near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
 
