@@ -488,6 +488,19 @@ def test_a_transient_beside_rounding_is_resolved():
     assert mesh.size < 24 * 8 * 8 + 100
 
 
+def test_rounding_in_proportion_to_the_length_is_found_out():
+    """Cuts into three or more parts make it smaller by as much, and never better."""
+    rng, rule = np.random.default_rng(3), radau_rule(14)
+
+    def evaluate(mesh, found, kept):
+        return found, 1e-4 * mesh.steps * rng.uniform(0.6, 1.5, mesh.size)
+
+    limits = {"tol": 1e-12, "max_elements": 200_000, "name": "law"}
+    mesh, _, tail = refine(evaluate, initial_mesh(0.0, 10.0, [], 24, rule), **limits)
+    assert mesh.size < 3000
+    assert tail.max() < 1e-3
+
+
 def test_a_short_element_keeps_the_digits_of_equations_without_derivatives():
     """x' = M ν, 0 = b − Mᵀx − ν: in 1e-11 s a pivot among the slopes took 11 of 16 digits of ν."""
     p, k, rng = 4, 2, np.random.default_rng(4)

@@ -385,3 +385,13 @@ def test_nothing_depends_on_when_the_clock_began(given):
 
     for one, other in zip(found(0.0), found(-8.0), strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("F", ["exp(-((t - 4)/0.3)**2)", "exp(20*(t - 8))"])
+def test_what_an_unknown_does_at_the_start_says_little_of_its_unit(F):
+    """1e-77 of what it does later was its unit, and 1e77 was an extension beyond all bounds."""
+    plant = {"name": "late", "states": ["x"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+             "unknowns": {"theta": 2.0}, "initial_state": [1.0],
+             "E": [[1]], "A": [[-1]], "B": [[1]], "F": [[F]], "C": [[1]]}
+    found = run(plant, estimator="least_squares", f0=1e-9, time={"horizon": 8, "samples": 5})
+    assert found.parameters["theta"] == pytest.approx(2.0, rel=1e-6)

@@ -53,7 +53,8 @@ def refine(
     """
     found: Found | None = None
     kept = np.full(mesh.size, -1)
-    floor: Array | float = np.inf  # the tail of the element that each one was cut from
+    # The tail of the element that each one was cut from, over the number of its parts.
+    floor: Array | float = np.inf
     missed: Array | float = 0.0  # how many cuts had no effect
     while True:
         held, found = [found], None  # ``evaluate`` may let go of it
@@ -62,8 +63,9 @@ def refine(
         if not poor.any():
             return mesh, found, tail
         poor &= tail > mesh.blur
-        # An element that was cut and is no better than the one it comes from shows rounding.
-        missed = np.where(tail <= 0.25 * floor, 0.0, missed + 1.0)
+        # An element that was cut and is no better than the one it comes from, but for what is in
+        # proportion to its length, shows rounding.
+        missed = np.where(tail <= 0.5 * floor, 0.0, missed + 1.0)
         poor &= (missed < patience) | (tail >= _ROUNDING)
         if not poor.any():
             return mesh, found, tail
@@ -92,7 +94,7 @@ def refine(
                     )
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         _check_budget(mesh, tail, parts, max_elements, name, advice)
-        before, cut = (np.broadcast_to(x, len(tail)).repeat(parts) for x in (floor, tail))
+        before, cut = (np.broadcast_to(x, len(tail)).repeat(parts) for x in (floor, tail / parts))
         missed = missed.repeat(parts)
         mesh, kept = mesh.split(parts)
         floor = np.where(kept < 0, cut, before)

@@ -28,6 +28,7 @@ _SINGULAR = 1e-12  # of the largest: singular values of what terms leave open
 _SOLVED = 1 << 13  # factors times terms, up to which products with what solves for them pay
 _OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
+_DECADES = 24.0  # of the unit of an unknown, at most: what rises later may be next to nothing yet
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
 
 
@@ -125,6 +126,7 @@ def units_at(c: Coefficients) -> Units:
     open_factor = factors[_first_of_each_part(linked, outputs_first)]
     of_row = open_factor - factors[: n + r]
     of_column = factors[n + r : -1] + open_factor[linked.argmax(axis=0)]
+    of_column[n:] = np.clip(of_column[n:], -_DECADES, _DECADES)
     rows, columns = (10.0 ** np.rint(part + _BESIDE_TIES) for part in (of_row, of_column))
     return Units(columns[:n], rows[:n], rows[n:], columns[n:])
 
