@@ -85,7 +85,8 @@ def quotient_of(s: Spectrum) -> tuple[Array, BoolArray, Array]:
     usable = (s.eigenvalues > _SINGULAR**2 * largest[:, None]).all(axis=1) & (largest > 0.0)
     inverse = reciprocals(s.eigenvalues, usable[:, None])
     whole = (s.vectors * inverse[:, None]) @ transpose(s.vectors)
-    return (s.vectors @ (inverse[..., None] * s.rotated))[..., 0], usable, whole
+    quotient = s.without_rounding(s.vectors @ (inverse[..., None] * s.rotated))
+    return quotient[..., 0], usable, whole
 
 
 class ScalarLaw:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
-from gpebo_cli.numerics.mesh import Mesh, unresolved_kinds
+from gpebo_cli.numerics.mesh import Kind, Mesh, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearProblem
 
 _MAX_PARTS = 8  # an element is cut into at most this many at once
@@ -101,7 +101,7 @@ def refine(
 
 
 def resolve(
-    evaluate: Callable[[Mesh], tuple[Found, list[tuple[Array, float]]]],
+    evaluate: Callable[[Mesh], tuple[Found, Sequence[Kind]]],
     mesh: Mesh, *, tol: float, max_elements: int, name: str,
 ) -> tuple[Mesh, Found, float]:
     """Resolve signals that are known: nothing is integrated.

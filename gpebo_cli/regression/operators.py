@@ -50,6 +50,12 @@ class Operator:
         out[since] = x(np.maximum(t[since], start), inside[since])
         return out.reshape(x.values.shape)
 
+    def most(self, elapsed: Array) -> Array | float:
+        """How many times as large its terms may be as the argument's were, so long after start."""
+        if self.name == "integral":
+            return elapsed
+        return 2.0 * self.number if self.name == "hp" else 1.0
+
     def carried(
         self, hold: str, known: OperatorState, t: Array, x: Array
     ) -> tuple[Array, OperatorState]:

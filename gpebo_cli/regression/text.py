@@ -39,8 +39,9 @@ from gpebo_cli.model.expressions.nodes import Node
 from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.model.expressions.tape import UNKNOWN
 from gpebo_cli.model.plant import named_values, plant_from_mapping, read_parameters
+from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
+from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables
@@ -74,7 +75,8 @@ class TextState:
     t: float
     operators: tuple[OperatorState, ...]
     row: Array  # (rows, p + 1) [ψ | Y]
-    scale: Array  # (p,) largest entry of each column of ψ so far
+    terms: Array  # (m + operators + p,) as of :meth:`TextRegression._terms`
+    start: float
     growth: None = field(default=None, init=False)  # there is no Φ
     log_norm: None = field(default=None, init=False)
     error_estimate: float = field(default=0.0, init=False)  # nothing is approximated but the hold
@@ -110,26 +112,61 @@ class TextRegression:
         Y (rows,) is needed where the text has none. ``tol`` is relative to each signal's own size;
         beside the regression comes the error estimate of its signals.
         """
+        p, noise = self.system.q, list[Array]()
 
-        def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array], list[tuple[Array, float]]]:
+        def terms(mesh: Mesh, columns: Array) -> Array:
+            t, nothing = mesh.points.ravel(), np.zeros(columns.shape[1] + p)
+            return self._terms(t, t - t[0], columns, nothing)[1].reshape(*mesh.points.shape, -1)
+
+        def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array, Array], list[Kind]]:
             columns, psi, right = self._on_mesh(signals, mesh)
+            if not noise:  # what may cancel on a first mesh is not smaller on another one
+                noise.append(ROUNDING * EPS / tol * terms(mesh, columns[0])[-1, -1])
             if right is None:
                 assert Y is not None  # noqa: S101  a source gives it
                 right = Y(mesh.points.ravel(), mesh.inside.ravel())
-            psi = psi.reshape(*mesh.points.shape, self.rows, -1)
-            right = right.reshape(*mesh.points.shape, self.rows)
-            kinds = [*columns[0].T, psi, right, outer_products(psi, right)]
-            return (psi, right), [(kind.reshape(*mesh.points.shape, -1), 0.0) for kind in kinds]
+            # Each column has the unit of its parameter.
+            sizes = np.maximum(largest_over_time(psi, 2), noise[0][-p:])
+            sizes = np.append(np.where(sizes > 0.0, sizes, 1.0), np.abs(right).max(initial=0.0))
+            products = outer_products(psi, right)
+            kinds: list[Kind] = [
+                *zip(columns[0].T[..., None], noise[0][:-p, None], strict=True), (right, 0.0),
+                (psi, np.tile(SHARE * sizes[:-1], self.rows)),
+                (products, SHARE * np.outer(sizes[:-1], sizes).ravel()),
+            ]
+            shape = mesh.points.shape
+            found = psi.reshape(*shape, self.rows, p), right.reshape(*shape, self.rows), columns[0]
+            return found, [(each.reshape(*shape, -1), floor) for each, floor in kinds]
 
-        mesh, (psi, right), error = resolve(
+        mesh, (psi, right, columns), error = resolve(
             evaluated, self._mesh(signals), tol=tol, max_elements=max_elements,
             name=f"regression {self.system.name}",
         )
         regression = LinearRegression(
             Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
-            float(np.abs(psi).max(initial=0.0)), parametrisation=self.parametrisation,
+            terms(mesh, columns)[:, -1, -p:], parametrisation=self.parametrisation,
         )
         return regression, error
+
+    def _terms(
+        self, t: Array, elapsed: Array, columns: Array, before: Array
+    ) -> tuple[Array, Array]:
+        """Sizes so far of signals and of what operators act on, and of the terms of each column.
+
+        The columns are those of ψ. At times t (N,), ``elapsed`` (N,) since the start, of signals
+        and operators (N, m + operators), after what was ``before`` (m + operators + p,), as what
+        comes (N, m + operators + p); beside it stand the sizes of the operators' own terms instead.
+        """
+        count = columns.shape[1]
+        so_far = np.maximum.accumulate(np.maximum(np.abs(columns), before[:count]), axis=0)
+        sizes = so_far.copy()
+        for k, operator in enumerate(self.operators, count - len(self.operators)):
+            argument = operator.argument.terms(t, columns, sizes)[:, 0]
+            so_far[:, k] = np.maximum.accumulate(np.maximum(argument, before[k]))
+            sizes[:, k] = operator.most(elapsed) * so_far[:, k]
+        psi = self.psi.terms(t, columns, sizes).reshape(len(t), self.rows, -1).max(axis=1)
+        psi = np.maximum.accumulate(np.maximum(psi, before[count:]), axis=0)
+        return np.hstack([so_far, psi]), np.hstack([sizes, psi])
 
     def _mesh(self, signals: Trajectory) -> Mesh:
         """The signals' mesh with an edge wherever something jumps or has a kink, or did before."""
@@ -235,18 +272,19 @@ class TextRegression:
         def outputs(tape: Tape, columns: Array) -> Array:
             return np.asarray(tape.taylor(t, 0, t, columns)[0])
 
-        _, psi, right = self._evaluated(signals, outputs, operate)
+        columns, psi, right = self._evaluated(signals, outputs, operate)
         right = Y if right is None else right
         rows = np.concatenate([psi, right.reshape(len(t), self.rows, 1)], axis=2)
-        scale = np.maximum.accumulate(np.abs(psi).max(axis=1, initial=0.0), axis=0)
-        if state is not None:
-            scale = np.maximum(scale, state.scale)
         last, row = (t[0], rows[0]) if state is None else (state.t, state.row)
+        start, count = last if state is None else state.start, columns.shape[2]
+        before = np.zeros(count + self.system.q) if state is None else state.terms
+        terms = self._terms(t, t - start, columns[0], before)[0]
         regression = SampledRegression(
             t, np.diff(t, prepend=last), np.concatenate([row[None], rows]), hold,
-            self.parametrisation, scale,
+            self.parametrisation, terms[:, count:],
         )
-        return TextState(float(t[-1]), tuple(reached), rows[-1], scale[-1]), regression
+        state = TextState(float(t[-1]), tuple(reached), rows[-1], terms[-1], float(start))
+        return state, regression
 
 
 class _Operators:

@@ -243,6 +243,26 @@ class Tape:
             places.append(jet)
         return places
 
+    def terms(self, t: Array, signals: Array, sizes: Array) -> Array:
+        """Sizes of the terms that make up each expression at times t (N,), (N, expressions).
+
+        Signals (N, m) may be sums themselves, of terms of these ``sizes`` (N, m).
+        """
+        places, found = self.run(t, 0, t, [[each] for each in signals.T]), list[Array]()
+        for (operation, arguments, value), jet in zip(self.instructions, places, strict=True):
+            of = [found[argument] for argument in arguments]
+            if operation == "signal":
+                found.append(sizes[:, int(value)])
+            elif operation == "add":
+                found.append(np.maximum(*of))
+            elif operation in ("multiply", "negative"):
+                found.append(np.prod(np.broadcast_arrays(*of), axis=0))
+            elif operation == "divide":
+                found.append(of[0] / np.abs(places[arguments[1]][0]))
+            else:
+                found.append(np.abs(jet[0]))
+        return np.stack([np.broadcast_to(found[k], len(t)) for k in self.outputs], axis=1)
+
     def _refuse(self, t: Array, order: int, inside: Array, signals: list[Jet] | None) -> None:
         """Raise the error for the first entry, and in it the innermost name, that is not finite."""
         for times in (t,) if inside is t else (t, inside):
