@@ -291,7 +291,7 @@ def power_requirement(alpha: float, gains: Array, energy: float, error: float) -
     """γ∫|Δ|^{1+α}, gains (g, 1 or p), against what errors of the start so large need to be zero."""
     needed = max(error ** (1.0 - alpha) / (1.0 - alpha), 1e-300)
     return energy_requirement(
-        "IE with enough ∫|Δ|^(1+α)", gains, energy, needed, "finite-time convergence", "∫|Δ|^(1+α)"
+        gains, energy, "IE with enough ∫|Δ|^(1+α)", needed, "finite-time convergence", "∫|Δ|^(1+α)"
     )
 
 
