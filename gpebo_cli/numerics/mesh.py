@@ -429,12 +429,7 @@ def initial_edges(
 ) -> Array:
     """The edges (K + 1,) of :func:`initial_mesh`, with breakpoints (B,) among them."""
     if not len(breakpoints):
-        # The same numbers as np.linspace without its end.
-        edges: Array = np.arange(elements + 1, dtype=np.float64)
-        edges *= (stop - start) / elements
-        edges += start
-        edges[-1] = stop
-        return edges
+        return np.linspace(start, stop, elements + 1)
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)

@@ -21,7 +21,6 @@ from gpebo_cli.numerics.mesh import (
     Kind,
     Mesh,
     initial_edges,
-    initial_mesh,
     legendre_tail,
     unresolved,
     unresolved_kinds,
@@ -51,9 +50,8 @@ def first_mesh(
     """A mesh without anything narrow between its nodes, jumps (B,), and whether that is sure."""
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges, bounded = system.coefficients.resolved(mesh.edges)
-    return Mesh(edges, mesh.rule), cuts, bounded
+    edges, bounded = system.coefficients.resolved(initial_edges(start, stop, cuts))
+    return Mesh(edges, radau_rule(solver.stages)), cuts, bounded
 
 
 def few_elements(system: DescriptorSystem, mesh: Mesh, cuts: Array, longest: float) -> Mesh:
