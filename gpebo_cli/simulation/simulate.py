@@ -152,8 +152,8 @@ def _solved(
         u, C, direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        y = _outputs(C, values[..., 0], direct)
-        size = largest_over_time(values[..., 0], 2)
+        x = values[..., 0]
+        y, size = np.einsum("...ij,...j->...i", C, x) + direct, largest_over_time(x, 2)
         least = least_sizes(problem, size[:, None], solver.tol)[:, 0]
         least = largest_over_time(C, 2) @ least
         return [(u, SHARE * terms(size)), (y, least)]
@@ -188,7 +188,7 @@ def _solved(
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C, direct = solution.extras
-    y = _outputs(C, x, direct)
+    y = np.einsum("...ij,...j->...i", C, x) + direct
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure, initial_state=x0,
@@ -313,10 +313,8 @@ def _amplification(form: StrangenessFree, units: Array, within: Array) -> Array:
 def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
     f1, extras = reduced.f1[:, :, None], (reduced.u, reduced.C, reduced.direct)
-    if not reduced.A2.shape[1]:
-        return LinearEquation(reduced.E1, reduced.A1, f1, extras, None, reduced.terms)
-    constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
-    return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints, reduced.terms)
+    own = Constraints(reduced.basis, reduced.offset[:, :, None]) if reduced.A2.shape[1] else None
+    return LinearEquation(reduced.E1, reduced.A1, f1, extras, own, reduced.terms)
 
 
 def _restarts(
@@ -342,13 +340,3 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
     i, j = B.nonzero()
     return lambda size: least_beside(A @ size, B[i, j], i, j, B.shape[1])
-
-
-def _outputs(C: Array, x: Array, direct: Array) -> Array:
-    """y = C x + direct at points (K, s + 1)."""
-    (K, points, n), r = x.shape, C.shape[2]
-    if C.shape[:2] == (1, 1):
-        y = (x.reshape(K * points, n) @ C[0, 0].T).reshape(K, points, r)
-    else:
-        y = np.matmul(C, x[..., None])[..., 0]
-    return np.asarray(y + direct)
