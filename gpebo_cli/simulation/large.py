@@ -76,14 +76,6 @@ def forcing(found: Entries) -> Row:
     return f
 
 
-def _placed(found: Entries, name: str, size: int) -> Array:
-    """A vector of the model, (orders, N or 1, size)."""
-    values = getattr(found.values, name)
-    out = np.zeros((*values.shape[:2], size))
-    out[:, :, found.places[name][0]] = values[:, :, found.which(name)]
-    return out
-
-
 class _Plant:
     """The plant on one mesh after the other: its entries, and what elimination makes of them."""
 
@@ -303,10 +295,9 @@ def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
     points = z.shape[:2]
     N = points[0] * points[1]
     x = plant.form.states_from(z.reshape(N, -1, 1))[:, :, 0]
-    u, theta = (
-        np.broadcast_to(_placed(found, name, size)[0], (N, size))
-        for name, size in (("u", system.m), ("theta", system.q))
-    )
+    u, theta = np.zeros((N, system.m)), np.zeros((N, system.q))
+    for name, signal in (("u", u), ("theta", theta)):
+        signal[:, found.places[name][0]] = getattr(found.values, name)[0][:, found.which(name)]
     y = np.zeros((system.r, N))
     for name, signal in (("C", x), ("D", u), ("H", theta)):
         for (i, j), value in found.of(name).items():
