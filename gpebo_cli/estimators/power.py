@@ -77,9 +77,8 @@ class Power(ResumableEstimator):
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> PowerEstimates:
         """Extend and mix as ``drem``, for the times t (M,)."""
-        inner = self.part(Drem).resume(regression, t, known)
-        own = {"alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2}
-        return PowerEstimates(**{**vars(inner), **own})
+        inner = vars(self.part(Drem).resume(regression, t, known))
+        return PowerEstimates(**inner, alpha=self.alpha, beta=self.beta, gamma2=self.gamma2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -256,10 +256,8 @@ class Online:
     @property
     def natural_sizes(self) -> Array:
         """√(∫Y²/∫ψ_j²) so far, (p,): the size of a parameter that alone would explain Y."""
-        size = np.linalg.norm(self.root, axis=0)
-        return np.asarray(np.divide(
-            size[-1], size[:-1], out=np.zeros(len(size) - 1), where=size[:-1] > 0.0
-        ))
+        *own, of_Y = np.linalg.norm(self.root, axis=0)
+        return np.array([of_Y / size if size > 0.0 else 0.0 for size in own])
 
     def doubts(
         self, sizes: Array | None = None, columns: IntArray | None = None
