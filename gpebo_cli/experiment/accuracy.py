@@ -142,9 +142,7 @@ def evaluation(
         )
         numbers = measure_squares(grid, squares, of_eta, of_x, judged, of_norms)
         if level is not None:
-            k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
-            before, after = errors(eta, k), errors(eta, np.minimum(k + 1, len(grid) - 1))
-            times = settled(grid, last, np.abs(before), np.abs(after), level)
+            times = settled(grid, last, lambda at: np.abs(errors(eta, at)), level)
             times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
             times[:, :p][:, ~judged] = np.nan
             numbers = np.concatenate([numbers, times.T])
