@@ -92,27 +92,20 @@ class Mesh:
         """Element lengths, shape (K,)."""
         return np.asarray(self.edges[1:] - self.edges[:-1])
 
-    @property
+    @cached_property
     def points(self) -> Array:
         """Left end and nodes of every element, shape (K, s + 1)."""
-        return self._places[0]
-
-    @property
-    def inside(self) -> Array:
-        """Where functions that jump are decided, shape (K, s + 1)."""
-        return self._places[1]
-
-    @cached_property
-    def _places(self) -> tuple[Array, Array]:
-        """Points, and where functions that jump are decided."""
         points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
         points[:, -1] = self.edges[1:]
-        inside = points.copy()
+        return self.origin + points if self.origin else points
+
+    @cached_property
+    def inside(self) -> Array:
+        """Where functions that jump are decided, shape (K, s + 1)."""
+        inside = self.points.copy()
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
-        if self.origin:
-            points, inside = self.origin + points, self.origin + inside
-        return points, inside
+        return inside
 
     def trajectory(self, flat: Array) -> Trajectory:
         """The signal (K, s + 1, …) with these values, one point after the other."""
