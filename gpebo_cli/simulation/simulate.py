@@ -13,7 +13,7 @@ from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import FollowsSignals, blur_of
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
+from gpebo_cli.numerics.errors import EPS, NOTHING, TINY, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -38,7 +38,6 @@ _SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too l
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
-_TINY = float(np.finfo(float).tiny)
 _AT_ONCE = 128  # elements of which all equations are held
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
 _LITTLE = 1e-11  # of a state: rounding of constraints of which a bound is below is not looked at
@@ -216,7 +215,7 @@ def _known_resolved(
     if solver.name == "ivp":
         c = evaluated(mesh)
         return mesh, c, _beside_inputs(c)
-    longest, first = SHORT / max(structure.rate, _TINY), float(mesh.steps.max())
+    longest, first = SHORT / max(structure.rate, TINY), float(mesh.steps.max())
     if first > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
     elif structure.steady and bounded and 2.0 * first <= longest:
