@@ -182,8 +182,6 @@ def _t_c(
         there = smallest >= np.maximum(enough, level)
         return there, there | (level <= enough)
 
-    if not enough:
-        return None
     return _first_time(
         regression.gram_parts(), regression.mesh.span, judged(smallest, level)[0],
         lambda at, matrices, rounding: judged(*seen(at, matrices, rounding)),
