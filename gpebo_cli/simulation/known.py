@@ -121,11 +121,8 @@ def cut_where(
     missed: Array | float = 0.0  # cuts in a row without effect
     while True:
         tail = tail_of(mesh, known)
-        poor = tail > tol
-        if not poor.any():
-            return mesh, known
         missed = np.where(tail < 0.25 * before, 0.0, missed + 1.0)
-        poor &= (missed < np.where(tail > 1e-6, _CUTS, 1)) & (tail > mesh.blur)
+        poor = (tail > tol) & (tail > mesh.blur) & (missed < np.where(tail > 1e-6, _CUTS, 1))
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > max_elements:
