@@ -72,7 +72,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         if structure.growth > growth:
             return None
         with np.errstate(all="ignore"):  # an iterate need not be finite
-            last[:] = [_solved(linear, window, settings, structure)]
+            last[:] = [_simulate_linear(linear, window, settings, structure)]
         return last[0].signals.states
 
     plant, source, before = system, cast(FollowsSignals, system.coefficients), None
@@ -104,16 +104,11 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
 
 def _simulate_linear(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings,
+    structure: Structure | None = None,
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
-    return _solved(system, time, solver, dense_structure(system, time, solver))
-
-
-def _solved(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, structure: Structure
-) -> Simulation:
-    """:func:`_simulate_linear` of a plant with this structure."""
+    structure = structure or dense_structure(system, time, solver)
     start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
     # Of many elements some are looked at, and the equations are made where they are solved.
