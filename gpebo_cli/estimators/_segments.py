@@ -114,8 +114,9 @@ def in_windows(
     def parts() -> Iterator[WindowEstimates]:
         known: Known = ()
         start = None
-        windows = zip(windowed(regression, t), windowed(regression, shown), strict=True)
-        for (own, window), (looked, _) in windows:
+        starts = [window.mesh.edges[0] for window in regression.windows()][1:]
+        times = (np.split(each, np.searchsorted(each, starts)) for each in (t, shown))
+        for own, looked, window in zip(*times, regression.windows(), strict=True):
             end = window.mesh.edges[-1]  # there may be no other time
             part = go_on(window, np.append(own, end), known)
             eta, delta = part.parameters(slice(None), start), part.delta(np.append(looked, end))
@@ -178,16 +179,6 @@ def errors(
         return one_after_another(starts, at), turns
 
     return [of_case(g) for g in range(len(estimator.cases))]
-
-
-def windowed(regression: LinearRegression, t: Array) -> Iterator[tuple[Array, LinearRegression]]:
-    """Those of the times t (M,), ascending, that are in each window, and the window."""
-    first = 0
-    for window in regression.windows():
-        end = window.mesh.edges[-1]
-        stop = len(t) if end == regression.mesh.edges[-1] else int(np.searchsorted(t, end))
-        yield t[first:stop], window
-        first = stop
 
 
 @dataclass(frozen=True, eq=False)
