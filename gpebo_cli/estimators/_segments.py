@@ -29,6 +29,8 @@ from gpebo_cli.regression.estimator import (
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, Reset
 
+GoOn = Callable[[LinearRegression, Array, Known], WindowEstimates]  # from a window to the next
+
 _FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
 _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 _MOST = 1 << 23  # numbers of estimates of all cases, which are held at once
@@ -72,11 +74,15 @@ def estimate(
         nothing = Requirement("none", True, {}, "there is nothing to estimate")
         return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)
     if not regression.resets:
-        found = in_windows(estimator, regression, t, t if shown is None else shown)
-        if found is None and regression.dynamics is not None:
-            moving = able(estimator, Moving, _FOLLOW)
-            return moving.estimate_moving(regression, t, (), regression.dynamics)
-        return estimator.estimate(regression, t) if found is None else found
+        moving: GoOn | None = None
+        if regression.dynamics is not None:
+            follow = able(estimator, Moving, _FOLLOW).estimate_moving
+            moving = partial(follow, dynamics=regression.dynamics)
+        few = len(estimator.cases) * t.size * regression.p <= _MOST
+        if regression.long and few and isinstance(estimator, Windowed):
+            shown = t if shown is None else shown
+            return in_windows(moving or estimator.go_on, regression, t, shown)
+        return moving(regression, t, ()) if moving else estimator.estimate(regression, t)
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
     parts: list[ResumableEstimates] = []
@@ -92,22 +98,12 @@ def estimate(
     return Chain(tuple(parts), regression.resets)
 
 
-def in_windows(
-    estimator: Estimator, regression: LinearRegression, t: Array, shown: Array
-) -> Found | None:
-    """Estimates at the times t (M,) of a long regression, window by window; None: not so.
+def in_windows(go_on: GoOn, regression: LinearRegression, t: Array, shown: Array) -> Found:
+    """Estimates at the times t (M,) of a long regression, window by window.
 
     What an estimator holds is that of one window; from one to the next it goes on as after a reset
     that changes nothing. Δ is found at the times ``shown`` (k,).
     """
-    if not (regression.long and isinstance(estimator, Windowed)):
-        return None
-    if len(estimator.cases) * t.size * regression.p > _MOST:
-        return None
-    go_on: Callable[[LinearRegression, Array, Known], WindowEstimates] = estimator.go_on
-    if regression.dynamics is not None:
-        moving = able(estimator, Moving, _FOLLOW)
-        go_on = partial(moving.estimate_moving, dynamics=regression.dynamics)
     etas: list[Array] = []
     deltas: list[Array | None] = []
 
