@@ -16,6 +16,7 @@ import numpy as np
 
 from gpebo_cli.kernels.laws_numpy import last_above
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.rows import of_lines
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
 _TINY = float(np.finfo(float).tiny)
@@ -147,7 +148,4 @@ def settled(t: Array, last: Array, sizes: Callable[[IntArray], Array], level: Ar
 
 def time_rms(t: Array, squares: Array) -> Array:
     """Root mean square over time (trapezoidal) of norms whose squares are (g, M), shape (g,)."""
-    weights = np.zeros(len(t))
-    weights[1:] = steps = 0.5 * (t[1:] - t[:-1])
-    weights[:-1] += steps
-    return np.asarray(np.sqrt(squares @ (weights / (t[-1] - t[0]))))
+    return np.asarray(np.sqrt(squares @ (of_lines(t) / (t[-1] - t[0]))))
