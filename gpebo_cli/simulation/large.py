@@ -174,11 +174,9 @@ def large_simulation(
     """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or series fail."""
     mesh, cuts, bounded = first_mesh(system, time, solver)
     plant = _Plant(system, solver.max_strangeness_index + 1)
-    try:
-        with np.errstate(all="ignore"):
-            return _simulated(plant, mesh, cuts, solver, bounded=bounded)
-    except (UndecidedError, RoundingError):
-        return None
+    with np.errstate(all="ignore"), suppress(UndecidedError, RoundingError):
+        return _simulated(plant, mesh, cuts, solver, bounded=bounded)
+    return None
 
 
 def structure_of(
