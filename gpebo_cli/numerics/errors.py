@@ -139,9 +139,7 @@ def judged_errors(
         known = np.maximum(scale, _FAINT * own.max(initial=0.0))
         if problem.units is not None:
             known = np.where(scale <= NOTHING * through, np.maximum(known, through), known)
-        lost = len(carried)
-        if not (largest < known).all():
-            lost = int(np.argmin((carried < known).all(axis=(1, 2))))
+        lost = int(np.argmin(np.append((carried < known).all(axis=(1, 2)), False)))
     return Errors(total, scale, beside, lost, carried[-1])
 
 
