@@ -417,9 +417,9 @@ def test_mixed_regression_holds(make):
     from gpebo_cli.numerics.linalg import determinant_and_adjugate_action
 
     values = make(CLEAN, np.array([0.1, 0.2, 0.3]))(T)
-    delta, Y, _ = determinant_and_adjugate_action(values[..., :3], values[..., 3])
+    delta, Y, _ = determinant_and_adjugate_action(values[..., :3], values[..., 3:])
     assert delta[0] == 0.0
-    np.testing.assert_allclose(Y, delta[:, None] * ETA, atol=1e-11 * np.abs(delta).max())
+    np.testing.assert_allclose(Y[..., 0], delta[:, None] * ETA, atol=1e-11 * np.abs(delta).max())
 
 
 def test_ls_drem_delta_is_the_reference_one():

@@ -19,7 +19,7 @@ from random_systems import largest_error, random_system, run_system
 from gpebo_cli import run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
-from gpebo_cli.experiment.sensors import _fall, _Found, candidates
+from gpebo_cli.experiment.sensors import _fall, candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results import style
 from gpebo_cli.results.figures import describe
@@ -255,9 +255,9 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
 
 def test_deviations_fall_by_the_mean_of_what_both_know():
     """4 and, as no row takes information away, 1: √(4·1); of nothing that both know, 1."""
-    before = _Found({"a": 4.0, "b": 1.0, "c": 0.0}, 0.0)
-    assert _fall(before, _Found({"a": 1.0, "b": 2.0, "c": 1.0}, 0.0)) == pytest.approx(2.0)
-    assert _fall(before, _Found({"c": 1.0}, 0.0)) == 1.0
+    before = {"a": 4.0, "b": 1.0, "c": 0.0}
+    assert _fall(before, {"a": 1.0, "b": 2.0, "c": 1.0}) == pytest.approx(2.0)
+    assert _fall(before, {"c": 1.0}) == 1.0
 
 
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])

@@ -29,18 +29,18 @@ def test_adjugate_of_any_rank(p, rank, seed):
     rank = min(rank, p)
     omega = rng.normal(size=(p, rank)) @ rng.normal(size=(rank, p))
     b = rng.normal(size=p)
-    det, action, _ = determinant_and_adjugate_action(omega[None], b[None])
+    det, action, _ = determinant_and_adjugate_action(omega[None], b[None, :, None])
     size = max(1.0, np.linalg.norm(omega, 2)) ** p
     assert det[0] == pytest.approx(np.linalg.det(omega), abs=1e-12 * size)
-    np.testing.assert_allclose(action[0], adjugate(omega) @ b, atol=1e-11 * size)
+    np.testing.assert_allclose(action[0, :, 0], adjugate(omega) @ b, atol=1e-11 * size)
 
 
 def test_mixing_identity():
     """adj(Ω) Ω η = det(Ω) η."""
     rng = np.random.default_rng(1)
     omega, eta = rng.normal(size=(50, 4, 4)), rng.normal(size=4)
-    det, action, _ = determinant_and_adjugate_action(omega, omega @ eta)
-    np.testing.assert_allclose(action, det[:, None] * eta, atol=1e-12 * np.abs(det).max())
+    det, action, _ = determinant_and_adjugate_action(omega, omega @ eta[:, None])
+    np.testing.assert_allclose(action[..., 0], det[:, None] * eta, atol=1e-12 * np.abs(det).max())
 
 
 def test_what_elimination_leaves_few_digits_of_is_left_to_singular_values():

@@ -14,6 +14,7 @@ from test_remedies import UNBOUNDED
 
 from gpebo_cli import run, system_from_functions
 from gpebo_cli.errors import ConfigError, GpeboError, ModelError
+from gpebo_cli.estimators import build
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.importers.matrices import from_control
 from gpebo_cli.model.plant import plant_from_mapping
@@ -165,7 +166,7 @@ def test_of_a_rank_of_E_that_changes_between_two_parts_of_a_stream():
         "inputs": {"u": 0},
     })
     settings = Settings({"name": "least_squares"}, observer={"name": "gpebo", "form": "given"})
-    online = Online(settings, switched, "zoh", 0.0, np.zeros(2))
+    online = Online(settings, switched, "zoh", 0.0, np.zeros(2), build(settings.estimator))
     online.feed(np.array([0.0, 0.5]), np.zeros((2, 1)), np.zeros((2, 1)))
     with pytest.raises(ModelError, match=r"rank of E changes from 1 to 2 before t = 1;"):
         online.feed(np.array([1.0]), np.zeros((1, 1)), np.zeros((1, 1)))

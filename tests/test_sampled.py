@@ -45,6 +45,10 @@ def run(system, estimator, horizon=5.0, **observer):
     return experiment(system, estimator, horizon, 2001, **observer)
 
 
+def online_of(settings, *arguments):
+    return Online(settings, *arguments, estimators.build(settings.estimator))
+
+
 def signals(system, t):
     found = simulate(system, TimeSettings(0.0, float(t[-1]), 11), SolverSettings()).signals
     return found.inputs(t), found.outputs(t)
@@ -205,7 +209,7 @@ def test_it_does_not_matter_how_samples_are_grouped():
     for name in ("ls_drem", "least_squares", "drem", *able):
         settings = Settings(estimator={"name": name})
         at_once, parts = (
-            Online(settings, system, "linear", t[0], np.append(u[0], y[0])) for _ in range(2)
+            online_of(settings, system, "linear", t[0], np.append(u[0], y[0])) for _ in range(2)
         )
         whole = at_once.feed(t, u, y)
         cuts = [0, 1, 2, 9, 40, 60]
@@ -259,7 +263,7 @@ def test_every_case_is_what_it_is_alone():
     def found(f0, gamma):
         estimator = {"name": "ls_drem", "f0": f0, "gamma": gamma}
         first = np.append(u[0], y[0])
-        return Online(Settings(estimator), system, "zoh", t[0], first).feed(t, u, y)
+        return online_of(Settings(estimator), system, "zoh", t[0], first).feed(t, u, y)
 
     together = found([1e-4, 1.0], [1.0, 10.0])
     alone = [found(f0, gamma) for f0 in (1e-4, 1.0) for gamma in (1.0, 10.0)]
@@ -281,9 +285,9 @@ def test_assumption_1_is_judged_by_its_weakest_sample():
     assert smallest == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
     t = np.arange(0.0, 6.0, 0.01)
     u, y = signals(system, t)
-    online = Online(Settings(estimator={"name": "least_squares"},
-                             observer={"name": "gpebo", "form": "given"}),
-                    system, "zoh", 0.0, np.append(u[0], y[0]))
+    online = online_of(Settings(estimator={"name": "least_squares"},
+                                observer={"name": "gpebo", "form": "given"}),
+                       system, "zoh", 0.0, np.append(u[0], y[0]))
     for part in (slice(0, 200), slice(200, 400), slice(400, 600)):  # π is in the second one
         online.feed(t[part], u[part], y[part])
     (one,) = (a for a in online.assumptions if a.name == "Assumption 1")
@@ -294,8 +298,8 @@ def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
     u, y = signals(system, t)
-    online = Online(Settings(estimator={"name": "ls_drem"}), system, "zoh", 0.0,
-                    np.append(u[0], y[0]))
+    online = online_of(Settings(estimator={"name": "ls_drem"}), system, "zoh", 0.0,
+                       np.append(u[0], y[0]))
     sizes = []
     for part in (slice(0, 100), slice(100, 200), slice(200, 400)):
         online.feed(t[part], u[part], y[part])
@@ -679,7 +683,7 @@ def test_what_a_stream_cannot_do(changes, part):
 
 
 def test_before_its_first_sample_a_stream_has_reached_no_time():
-    online = Online(STREAM, shipped("circuit"), "zoh", 0.0, np.zeros(2))
+    online = online_of(STREAM, shipped("circuit"), "zoh", 0.0, np.zeros(2))
     with pytest.raises(ValueError, match="there have been no samples"):
         _ = online.reached
 

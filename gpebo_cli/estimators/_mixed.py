@@ -138,7 +138,7 @@ def reached(size: Array, extended: Trajectory, known: Known) -> ExtensionState:
 
 
 def energy_requirement(
-    condition: str, gains: Array, energy: float, needed: float,
+    gains: Array, energy: float, condition: str, needed: float,
     needed_for: str = _ONE_PERCENT, of: str = "∫Δ²", *, paced: bool = False,
 ) -> Requirement:
     """Whether ∫Δ² is enough at the smallest gain of (g, 1 or p): the error shrinks by e^{−γ∫Δ²}.
@@ -193,10 +193,9 @@ class RecursiveMixed:
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² so far, at the smallest gain and in the group that has the least."""
-        condition, needed, what = self._aim
+        law = self._law
         return energy_requirement(
-            condition, self._law.gains, float(self._law.energy.min()), needed, what,
-            paced=self._paced,
+            law.gains, float(law.energy.min()), *self._aim, paced=self._paced
         )
 
 
@@ -243,11 +242,8 @@ class MixedEstimates(Lasting):
     @property
     def requirement(self) -> Requirement:
         """γ∫Δ² over the horizon: the error has shrunk by its exponential."""
-        condition, needed, what = aim(self.condition, self.mu)
-        paced = self.groups[0].pace is not None
-        return energy_requirement(
-            condition, self.gains, min(self.energies), needed, what, paced=paced
-        )
+        aimed, paced = aim(self.condition, self.mu), self.groups[0].pace is not None
+        return energy_requirement(self.gains, min(self.energies), *aimed, paced=paced)
 
     def law(self, path: ScalarPath, start: Array, gains: Array) -> Array:
         """η̂ (g, M, P) from ``start`` (P,) or (g, P) with ``gains`` (g, P or 1)."""

@@ -147,7 +147,7 @@ class ScalarLaw:
         before, self._inverse = self._inverse, [Q[-1:] for Q in quotients]
         for d, (own, Q) in enumerate(zip(filters, quotients, strict=True)):
             previous = np.concatenate([Q[:1] if before is None else before[d], Q[:-1]])
-            A_f, (K, p, s) = own.A, Q.shape
+            K, p, s = Q.shape
             for g in range(decay.shape[2]):
                 keep, new, old, by = (
                     np.broadcast_to(each[:, d, g], (K, p))[:, :, None]
@@ -155,15 +155,17 @@ class ScalarLaw:
                 )
                 both = had[:, d, None, None]
                 on_new, on_old = (new + np.where(both, 0.0, old)) * Q, np.where(both, old, 0.0)
-                A = np.zeros((K, s + p, s + p))
-                A[:, :s, :s] = A_f
-                A[:, s:, :s] = on_new @ A_f + on_old * previous
-                A[:, s:, s:] = keep * np.eye(p)
-                out.append(ErrorRecursion(
-                    A, np.concatenate([own.old, on_new @ own.old], axis=1),
-                    np.concatenate([own.new, on_new @ own.new], axis=1), np.eye(p, s + p, s) / by,
-                ))
+                whole = in_series(own, keep * np.eye(p), on_new, on_old * previous)
+                out.append(ErrorRecursion(*whole, np.eye(p, s + p, s) / by))
         return tuple(out)
+
+
+def in_series(own: Filter, keep: Array, of_new: Array, of_old: Array) -> Filter:
+    """A filter of f (s,) and what is behind it, z' = keep z + of_new f' + of_old f with z (q,)."""
+    (K, s), q = own.A.shape[:2], keep.shape[-1]
+    A = np.zeros((K, s + q, s + q))
+    A[:, :s, :s], A[:, s:, :s], A[:, s:, s:] = own.A, of_new @ own.A + of_old, keep
+    return Filter(A, *(np.concatenate([x, of_new @ x], axis=1) for x in (own.old, own.new)))
 
 
 class Mixed(NamedTuple):

@@ -29,6 +29,8 @@ from gpebo_cli.regression.estimator import (
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, Reset
 
+GoOn = Callable[[LinearRegression, Array, Known], WindowEstimates]  # from a window to the next
+
 _FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
 _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
 _MOST = 1 << 23  # numbers of estimates of all cases, which are held at once
@@ -72,11 +74,15 @@ def estimate(
         nothing = Requirement("none", True, {}, "there is nothing to estimate")
         return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)
     if not regression.resets:
-        found = in_windows(estimator, regression, t, t if shown is None else shown)
-        if found is None and regression.dynamics is not None:
-            moving = able(estimator, Moving, _FOLLOW)
-            return moving.estimate_moving(regression, t, (), regression.dynamics)
-        return estimator.estimate(regression, t) if found is None else found
+        moving: GoOn | None = None
+        if regression.dynamics is not None:
+            follow = able(estimator, Moving, _FOLLOW).estimate_moving
+            moving = partial(follow, dynamics=regression.dynamics)
+        few = len(estimator.cases) * t.size * regression.p <= _MOST
+        if regression.long and few and isinstance(estimator, Windowed):
+            shown = t if shown is None else shown
+            return in_windows(moving or estimator.go_on, regression, t, shown)
+        return moving(regression, t, ()) if moving else estimator.estimate(regression, t)
     segments = regression.segments
     first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
     parts: list[ResumableEstimates] = []
@@ -92,30 +98,21 @@ def estimate(
     return Chain(tuple(parts), regression.resets)
 
 
-def in_windows(
-    estimator: Estimator, regression: LinearRegression, t: Array, shown: Array
-) -> Found | None:
-    """Estimates at the times t (M,) of a long regression, window by window; None: not so.
+def in_windows(go_on: GoOn, regression: LinearRegression, t: Array, shown: Array) -> Found:
+    """Estimates at the times t (M,) of a long regression, window by window.
 
     What an estimator holds is that of one window; from one to the next it goes on as after a reset
     that changes nothing. Δ is found at the times ``shown`` (k,).
     """
-    if not (regression.long and isinstance(estimator, Windowed)):
-        return None
-    if len(estimator.cases) * t.size * regression.p > _MOST:
-        return None
-    go_on: Callable[[LinearRegression, Array, Known], WindowEstimates] = estimator.go_on
-    if regression.dynamics is not None:
-        moving = able(estimator, Moving, _FOLLOW)
-        go_on = partial(moving.estimate_moving, dynamics=regression.dynamics)
     etas: list[Array] = []
     deltas: list[Array | None] = []
 
     def parts() -> Iterator[WindowEstimates]:
         known: Known = ()
         start = None
-        windows = zip(windowed(regression, t), windowed(regression, shown), strict=True)
-        for (own, window), (looked, _) in windows:
+        starts = [window.mesh.edges[0] for window in regression.windows()][1:]
+        times = (np.split(each, np.searchsorted(each, starts)) for each in (t, shown))
+        for own, looked, window in zip(*times, regression.windows(), strict=True):
             end = window.mesh.edges[-1]  # there may be no other time
             part = go_on(window, np.append(own, end), known)
             eta, delta = part.parameters(slice(None), start), part.delta(np.append(looked, end))
@@ -178,16 +175,6 @@ def errors(
         return one_after_another(starts, at), turns
 
     return [of_case(g) for g in range(len(estimator.cases))]
-
-
-def windowed(regression: LinearRegression, t: Array) -> Iterator[tuple[Array, LinearRegression]]:
-    """Those of the times t (M,), ascending, that are in each window, and the window."""
-    first = 0
-    for window in regression.windows():
-        end = window.mesh.edges[-1]
-        stop = len(t) if end == regression.mesh.edges[-1] else int(np.searchsorted(t, end))
-        yield t[first:stop], window
-        first = stop
 
 
 @dataclass(frozen=True, eq=False)

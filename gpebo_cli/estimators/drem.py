@@ -56,7 +56,7 @@ def follow(
     mixed = Trajectory(mesh, delta)
     energy = sum(each.energy for each in known) + float(Trajectory(mesh, delta**2).integral().final)
     requirement = energy_requirement(
-        "γ∫Δ² above the growth of the state", gains, energy, dynamics.growth + DECAY,
+        gains, energy, "γ∫Δ² above the growth of the state", dynamics.growth + DECAY,
         f"1 % of the initial error of a state that may grow by e^{dynamics.growth:.3g}",
     )
     state = replace(state_of(extended, known), energy=energy)

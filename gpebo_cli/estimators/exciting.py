@@ -25,7 +25,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import WindowedEstimator, gain
 from gpebo_cli.estimators._mixed import MixedEstimates, RecursiveMixed, scalar_errors
-from gpebo_cli.estimators._recursive import Mixed, Steps
+from gpebo_cli.estimators._recursive import Mixed, Steps, in_series
 from gpebo_cli.estimators._scalar import ScalarPath, filled, resolved_for, scalar_path
 from gpebo_cli.estimators.drem import Drem
 from gpebo_cli.model.descriptor import Array
@@ -158,24 +158,19 @@ class Rotation:
 
         def errors() -> tuple[list[Filter], list[Array]]:
             (own,), (Q,) = mixed.behind()
-            K, p = mean.shape
+            p = mean.shape[1]
             before = Q[:1] if self._inverse is None else self._inverse
             previous, self._inverse = np.concatenate([before, Q[:-1]]), Q[-1:]
             share = np.where(both, 0.5, 1.0)[:, None, None]
             # δη̄ of a step is what follows from δ𝒴 before it and from both ends of it.
-            of_state = share * Q @ own.A + (1.0 - share) * previous
-            of_old, of_new = share * Q @ own.old, share * Q @ own.new
             cos, sin, eye = turn.real[:, None, None], turn.imag[:, None, None], np.eye(p)
-            A = np.zeros((K, 3 * p, 3 * p))
-            A[:, :p, :p] = own.A
-            A[:, p : 2 * p, p:] = np.concatenate([cos * eye, -sin * eye], axis=2)
-            A[:, 2 * p :, p:] = np.concatenate([sin * eye, cos * eye], axis=2)
-            A[:, p:, :p] = np.concatenate([(cos - 1.0) * of_state, sin * of_state], axis=1)
-            old, new = (
-                np.concatenate([first, (cos - 1.0) * then, sin * then], axis=1)
-                for first, then in ((own.old, of_old), (own.new, of_new))
+            keep = np.block([[cos * eye, -sin * eye], [sin * eye, cos * eye]])
+            of_new, of_old = (
+                np.concatenate([(cos - 1.0) * x, sin * x], axis=1)
+                for x in (share * Q, (1.0 - share) * previous)
             )
-            return [Filter(A, old, new)], [inverse[:, None, None] * np.eye(p, 3 * p, 2 * p)]
+            whole = in_series(own, keep, of_new, of_old)
+            return [whole], [inverse[:, None, None] * np.eye(p, 3 * p, 2 * p)]
 
         return Mixed(new[:, None], (inverse[:, None] * e_2)[:, None], known[:, None], errors)
 

@@ -160,7 +160,7 @@ class MonotoneEstimates:
     def requirement(self) -> Requirement:
         """γμ∫Δ² over the horizon: the error has shrunk by its exponential."""
         energy = float(self.path.energy_at_t[-1])
-        return energy_requirement("Δ not in L2", self.gains, energy, DECAY / self.mu)
+        return energy_requirement(self.gains, energy, "Δ not in L2", DECAY / self.mu)
 
 
 class RecursiveMonotone:
@@ -228,7 +228,7 @@ class RecursiveMonotone:
     @property
     def requirement(self) -> Requirement:
         """γμ∫Δ² so far."""
-        return energy_requirement("Δ not in L2", self._gains, self._energy, DECAY / self._mu)
+        return energy_requirement(self._gains, self._energy, "Δ not in L2", DECAY / self._mu)
 
 
 ESTIMATOR = Monotone

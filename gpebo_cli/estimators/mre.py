@@ -14,7 +14,7 @@ import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, filtered_errors, gain
 from gpebo_cli.estimators._mixed import reached
-from gpebo_cli.estimators._recursive import KreisselmeierFilter, over_steps
+from gpebo_cli.estimators._recursive import KreisselmeierFilter, in_series, over_steps
 from gpebo_cli.estimators._scalar import kreisselmeier
 from gpebo_cli.estimators._vector import (
     VectorEstimates,
@@ -126,18 +126,12 @@ class RecursiveMemoryExtension(VectorRecursion):
 
         def errors() -> tuple[ErrorRecursion, ...]:
             """δ𝒴 of the filters, δη̂' = (I − L∫Ω) δη̂ + L ∫δ𝒴, of every case."""
-            own, K = self._filter.errors(), len(omega)
+            own, eta_of = self._filter.errors(), np.eye(p, 2 * p, p)[None]
             old, new = (share[:, None, None] for share in regression.shares)
-            out = []
-            for by, left in zip(L, shrunk, strict=True):
-                A = np.zeros((K, 2 * p, 2 * p))
-                A[:, :p, :p], A[:, p:, p:] = own.A, left
-                A[:, p:, :p] = by @ (old * np.eye(p) + new * own.A)
-                of_old, of_new = (
-                    np.concatenate([e, by @ (new * e)], axis=1) for e in (own.old, own.new)
-                )
-                out.append(ErrorRecursion(A, of_old, of_new, np.eye(p, 2 * p, p)[None]))
-            return tuple(out)
+            return tuple(
+                ErrorRecursion(*in_series(own, left, new * by, old * by), eta_of)
+                for by, left in zip(L, shrunk, strict=True)
+            )
 
         return SampledEstimates(eta, None, errors, met)
 

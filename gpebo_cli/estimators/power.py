@@ -77,9 +77,8 @@ class Power(ResumableEstimator):
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> PowerEstimates:
         """Extend and mix as ``drem``, for the times t (M,)."""
-        inner = self.part(Drem).resume(regression, t, known)
-        own = {"alpha": self.alpha, "beta": self.beta, "gamma2": self.gamma2}
-        return PowerEstimates(**{**vars(inner), **own})
+        inner = vars(self.part(Drem).resume(regression, t, known))
+        return PowerEstimates(**inner, alpha=self.alpha, beta=self.beta, gamma2=self.gamma2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -291,7 +290,7 @@ def power_requirement(alpha: float, gains: Array, energy: float, error: float) -
     """γ∫|Δ|^{1+α}, gains (g, 1 or p), against what errors of the start so large need to be zero."""
     needed = max(error ** (1.0 - alpha) / (1.0 - alpha), 1e-300)
     return energy_requirement(
-        "IE with enough ∫|Δ|^(1+α)", gains, energy, needed, "finite-time convergence", "∫|Δ|^(1+α)"
+        gains, energy, "IE with enough ∫|Δ|^(1+α)", needed, "finite-time convergence", "∫|Δ|^(1+α)"
     )
 
 

@@ -114,10 +114,7 @@ def assess(
     # Of parameters that move one pass of filters serves all of the times.
     first = regression.gram_with_rounding(t, parts()) if regression.dynamics else None
     seen = cache(lambda: first or later.gram_with_rounding(t))
-    end = (
-        (first[0][-1:], np.zeros((1, regression.p))) if first
-        else regression.gram_with_rounding(t[-1:])
-    )
+    end = regression.gram_with_rounding(t[-1:])
 
     def eigenvalues(gram: Array) -> Array:
         return np.maximum(symmetric_eigenvalues(gram), 0.0)
@@ -182,8 +179,6 @@ def _t_c(
         there = smallest >= np.maximum(enough, level)
         return there, there | (level <= enough)
 
-    if not enough:
-        return None
     return _first_time(
         regression.gram_parts(), regression.mesh.span, judged(smallest, level)[0],
         lambda at, matrices, rounding: judged(*seen(at, matrices, rounding)),

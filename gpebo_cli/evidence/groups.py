@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array, IntArray
-from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.numerics.rows import Rows, of_lines
 
 _DEGREE = 3
 _NONE, _NOWHERE = np.zeros(0), np.zeros(0, dtype=np.intp)
@@ -86,7 +86,7 @@ def grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int
             k += max(1, min(most, (k - origin) // per))  # noqa: PLW2901
     first = np.array(found)
     if lines:  # what each row counts for, and what the first ones of groups do, with lines between
-        own, whole = (_of_lines(x) for x in (instants, instants[first]))
+        own, whole = (of_lines(x) for x in (instants, instants[first]))
         group = np.repeat(np.arange(len(first)), np.diff(first, append=count))
         tau = (instants - instants[first][group]) / np.diff(instants[first], append=np.inf)[group]
         squares = np.bincount(group, (1.0 - tau) * own**2)
@@ -97,12 +97,6 @@ def grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int
         instants[first], instants[(first + 1).clip(max=count - 1)], np.sqrt(squares) / whole,
         np.zeros((len(first), int(lines))), np.arange(len(first)), np.delete(instants, first),
     )
-
-
-def _of_lines(t: Array) -> Array:
-    """∫ of what straight lines between times (N,) make of 1 at one of them and 0 at the others."""
-    half = 0.5 * np.diff(t)
-    return np.asarray(np.append(half, 0.0) + np.append(0.0, half))
 
 
 def each_alone(rows: Rows, starts: Array) -> Groups:

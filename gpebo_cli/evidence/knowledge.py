@@ -201,7 +201,7 @@ def knowledge(
 
 def knowledge_of_roots(root: Array, terms: Array, elapsed: Array, tol: float = 1e-12) -> Knowledge:
     """The same from S (M, p, p) with SᵀS = G: no squares are formed."""
-    sizes, level = _sizes(np.linalg.norm(root, axis=1), terms, elapsed, tol)
+    sizes, level = own_sizes(np.square(root).sum(axis=1), terms, elapsed, tol)
     scaled = root / sizes[:, None, :] * np.where(level < 1.0, 1.0, 0.0)[:, None, :]
     _, sigma, Vt = np.linalg.svd(scaled)
     return Knowledge(sizes, sigma[:, ::-1] ** 2, np.swapaxes(Vt, 1, 2)[:, :, ::-1], level)
@@ -213,20 +213,12 @@ def own_sizes(
 ) -> tuple[Array, Array]:
     """√G_jj (M, p), or the size of its terms where a column is rounding; which share is rounding.
 
-    The ``energy`` is G_jj (M, p); the other arguments are those of :func:`knowledge`.
+    The ``energy`` is G_jj (M, p); the other arguments are those of :func:`knowledge`. What is small
+    beside the terms of a column is so in x, too.
     """
     energy = np.maximum(energy, _TINY**2)
-    sizes, level = _sizes(np.sqrt(energy), terms, elapsed, tol)
-    return sizes, np.maximum(level, np.minimum(rounding / energy, 1.0))
-
-
-def _sizes(sizes: Array, terms: Array | float, elapsed: Array, tol: float) -> tuple[Array, Array]:
-    """√G_jj and the levels of columns, from what their rounding would amount to.
-
-    A column that is rounding has the size of its terms: what is small beside those is so in x, too.
-    """
-    whole = terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
-    rounding = np.maximum(_UNRESOLVED * tol * whole, _TINY)
-    level = np.square(rounding / np.maximum(sizes, rounding))
-    seen = np.where(sizes > rounding, sizes, whole)
-    return np.maximum(seen, _TINY), np.maximum(level, _SINGULAR)
+    sizes, whole = np.sqrt(energy), terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
+    least = np.maximum(_UNRESOLVED * tol * whole, _TINY)
+    level = np.maximum(np.square(least / np.maximum(sizes, least)), _SINGULAR)
+    seen = np.maximum(np.where(sizes > least, sizes, whole), _TINY)
+    return seen, np.maximum(level, np.minimum(rounding / energy, 1.0))

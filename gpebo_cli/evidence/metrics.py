@@ -9,13 +9,14 @@ The root mean square over time is √(∫e² dt / horizon).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from gpebo_cli.kernels.laws_numpy import last_above
-from gpebo_cli.model.descriptor import Array, BoolArray
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.rows import of_lines
 
 SETTLED = 0.01  # share of an error at the start, below which it has settled
 _TINY = float(np.finfo(float).tiny)
@@ -124,33 +125,27 @@ def _settled(
             last_above(error[:, :, None], own[:, None, None])[:, 0]
             for error, own in zip(errors, level, strict=True)
         ]).reshape(level.shape)
-    rows, k = np.arange(level.shape[1]), np.clip(last, 0, max(len(t) - 2, 0)).astype(np.intp)
-    before, after = (
-        np.array([error[rows, at] for error, at in zip(errors, places, strict=True)])
-        .reshape(level.shape)
-        for places in (k, np.minimum(k + 1, len(t) - 1))
-    )
-    return settled(t, last, before, after, level)
+    rows = np.arange(level.shape[1])
+    return settled(t, last, lambda at: np.array([
+        error[rows, k] for error, k in zip(errors, at, strict=True)
+    ]).reshape(level.shape), level)
 
 
-def settled(t: Array, last: Array, before: Array, after: Array, level: Array) -> Array:
+def settled(t: Array, last: Array, sizes: Callable[[IntArray], Array], level: Array) -> Array:
     """:func:`settling_times` (...) where it is known when an error is above its level last.
 
-    ``last`` is the index of that time among t (M,), −1 where there is none, ``before`` and
-    ``after`` are the error there and at the next time, ``level`` is that of the error.
+    ``last`` is the index of that time among t (M,), −1 where there is none, and ``sizes`` are those
+    of the error at such indices.
     """
-    high, low, wanted = (np.log(np.maximum(e, _TINY)) for e in (before, after, level))
+    k = np.maximum(np.minimum(last, len(t) - 2), 0).astype(np.intp)
+    after = np.minimum(k + 1, len(t) - 1)
+    high, low, wanted = (np.log(np.maximum(e, _TINY)) for e in (sizes(k), sizes(after), level))
     with np.errstate(over="ignore"):  # where it does not fall, and the result is another one
         share = np.maximum((high - wanted) / np.maximum(high - low, _TINY), 0.0)
-    k = np.maximum(np.minimum(last, len(t) - 2), 0).astype(np.intp)
-    before, after = t[k], t[np.minimum(k + 1, len(t) - 1)]
-    crossed = before + np.minimum(share, 1.0) * (after - before) - t[0]
+    crossed = t[k] + np.minimum(share, 1.0) * (t[after] - t[k]) - t[0]
     return np.where(last < 0, 0.0, np.where(last < len(t) - 1, crossed, np.nan))
 
 
 def time_rms(t: Array, squares: Array) -> Array:
     """Root mean square over time (trapezoidal) of norms whose squares are (g, M), shape (g,)."""
-    weights = np.zeros(len(t))
-    weights[1:] = steps = 0.5 * (t[1:] - t[:-1])
-    weights[:-1] += steps
-    return np.asarray(np.sqrt(squares @ (weights / (t[-1] - t[0]))))
+    return np.asarray(np.sqrt(squares @ (of_lines(t) / (t[-1] - t[0]))))

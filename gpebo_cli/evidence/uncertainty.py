@@ -76,9 +76,9 @@ def deviations(
     anew = edges[:1] if starts is None else starts
     while True:
         groups = grouped(rows, edges[-1], t, anew, most, per)
-        found = _propagated(
-            observer, estimator, gain, edges, groups, variances, t, anew, resets
-        )
+        found = _Chain(
+            observer, estimator, gain.shape[1], edges, groups, variances, anew, resets
+        ).deviations(t, gain)
         if groups.alone or (before is not None and _agree(before, found)):
             return found[:, :p], found[:, p:]
         finer = 2 if before is None else 4
@@ -89,53 +89,6 @@ def _agree(coarse: Array, fine: Array) -> bool:
     coarse, fine = np.nan_to_num(coarse), np.nan_to_num(fine)  # where they are unknown
     largest = fine.max(axis=0, initial=0.0)
     return bool((np.abs(coarse - fine) <= _AGREE * (fine + _AGREE * largest)).all())
-
-
-def _propagated(
-    observer: ErrorsAt, estimator: ErrorsAt, gain: Array, edges: Array, groups: Groups,
-    variances: Array, t: Array, starts: Array, resets: Sequence[tuple[float, Array]],
-) -> Array:
-    """:func:`deviations` of grouped rows, side by side (M, p + n); the gain is (M, n, p)."""
-    n, p = gain.shape[1:]
-    chain = _Chain(observer, estimator, n, edges, groups, variances, starts, resets)
-    mesh, found = chain.mesh, np.empty((len(t), p + n))
-    stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
-    cuts = mesh.edges[stretch:-1:stretch]
-    all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
-    for first, chosen in zip(range(0, mesh.size, stretch), all_t, strict=True):
-        part = Mesh(mesh.edges[first : first + stretch + 1], mesh.rule)
-        part, joint = chain.looked(part, t[chosen])
-        if chain.rate * (edges[-1] - edges[0]) > _FASTEST:
-            return np.full(found.shape, np.nan)
-        part, maps, factors, (common, varies) = chain.along(part, joint, t[chosen])
-        if not len(chosen):
-            continue
-        zeta, size, own = chain.zeta, maps.shape[2], np.arange(len(variances))
-        sampler = part.sampler(t[chosen])
-        element, places = sampler.element, sampler.weights
-        before, group = factors[element], _group_of(part, groups.starts)[element]
-        here = np.zeros((len(chosen), size + len(own), before.shape[1]))  # of [ζ; s; e]
-        here[:, :size] = Sampler(element, places[:, 1:])(maps)
-        np.einsum("mii->mi", here[:, :size, :size])[...] += places[:, :1]
-        now = groups.weights(t[chosen], group, groups.after)
-        if not groups.alone:  # errors of one row and the one behind it, not of many
-            now = now / chain.shares[group].T
-        for k, each in enumerate(now):
-            here[:, size + own, size + k * len(own) + own] = each[:, None]
-        inside = part.inside[element, 1]
-        C = common[None].repeat(len(chosen), axis=0)
-        if len(others := varies[element].nonzero()[0]):
-            C[others] = estimator(t[chosen][others], inside[others]).C
-        o = chain.observer(t[chosen], inside)
-        rows = o.C.shape[1] - n  # of Y; those of the offset stand below
-        out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
-        out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
-        out[:, p:, :zeta], out[:, p:, size:] = o.C[:, rows:], o.D[:, rows:]
-        found[chosen] = _sizes(out @ here @ before)
-    if chain.unknown:  # one row alone says nothing of that, but rounding does
-        row = groups.after[0] - groups.starts[0]
-        found[t < groups.after[0] + _SNAP * row] = np.nan
-    return found
 
 
 def _sizes(rows: Array) -> Array:
@@ -173,6 +126,49 @@ class _Chain:
         self._until = np.append(groups.starts[1:], np.inf)
         self._L: Array | None = None
         self._group = -1  # the last one
+
+    def deviations(self, t: Array, gain: Array) -> Array:
+        """:func:`deviations` at the times t (M,) side by side (M, p + n), for a gain (M, n, p)."""
+        n, p = gain.shape[1:]
+        mesh, groups, found = self.mesh, self._groups, np.empty((len(t), p + n))
+        own = np.arange(self._deviations.shape[2])  # errors of one sample
+        stretch = max(1, _CHUNK // ((n + 3 * p) * mesh.rule.stages) ** 2)
+        cuts = mesh.edges[stretch:-1:stretch]
+        all_t = np.split(np.arange(len(t)), np.searchsorted(t, cuts))
+        for first, chosen in zip(range(0, mesh.size, stretch), all_t, strict=True):
+            part = Mesh(mesh.edges[first : first + stretch + 1], mesh.rule)
+            part, joint = self.looked(part, t[chosen])
+            if self.rate * (mesh.edges[-1] - mesh.edges[0]) > _FASTEST:
+                return np.full(found.shape, np.nan)
+            part, maps, factors, (common, varies) = self.along(part, joint, t[chosen])
+            if not len(chosen):
+                continue
+            zeta, size = self.zeta, maps.shape[2]
+            sampler = part.sampler(t[chosen])
+            element, places = sampler.element, sampler.weights
+            before, group = factors[element], _group_of(part, groups.starts)[element]
+            here = np.zeros((len(chosen), size + len(own), before.shape[1]))  # of [ζ; s; e]
+            here[:, :size] = Sampler(element, places[:, 1:])(maps)
+            np.einsum("mii->mi", here[:, :size, :size])[...] += places[:, :1]
+            now = groups.weights(t[chosen], group, groups.after)
+            if not groups.alone:  # errors of one row and the one behind it, not of many
+                now = now / self.shares[group].T
+            for k, each in enumerate(now):
+                here[:, size + own, size + k * len(own) + own] = each[:, None]
+            inside = part.inside[element, 1]
+            C = common[None].repeat(len(chosen), axis=0)
+            if len(others := varies[element].nonzero()[0]):
+                C[others] = self._estimator(t[chosen][others], inside[others]).C
+            o = self.observer(t[chosen], inside)
+            rows = o.C.shape[1] - n  # of Y; those of the offset stand below
+            out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
+            out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
+            out[:, p:, :zeta], out[:, p:, size:] = o.C[:, rows:], o.D[:, rows:]
+            found[chosen] = _sizes(out @ here @ before)
+        if self.unknown:  # one row alone says nothing of that, but rounding does
+            row = groups.after[0] - groups.starts[0]
+            found[t < groups.after[0] + _SNAP * row] = np.nan
+        return found
 
     def looked(self, mesh: Mesh, t: Array) -> tuple[Mesh, ErrorSystem]:
         """The next elements with layers where times t (M,) are, and their joint system."""

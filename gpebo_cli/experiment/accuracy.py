@@ -19,6 +19,7 @@ from gpebo_cli.evidence.metrics import (
 )
 from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.numerics.linalg import reciprocals
 from gpebo_cli.observers import StateMap
 from gpebo_cli.observers._base import AffineStateMap
 from gpebo_cli.regression.linear import LinearRegression
@@ -54,8 +55,7 @@ def judged_of(system: DescriptorSystem, p: int) -> BoolArray:
 
 def _weights(sizes: Array, counted: BoolArray) -> Array:
     """1/size², and 0 for what does not count or has no size."""
-    counted = counted & (sizes > 0.0)
-    return np.divide(1.0, sizes**2, out=np.zeros(len(sizes)), where=counted)
+    return reciprocals(sizes**2, counted & (sizes > 0.0))
 
 
 def told(determined: BoolArray) -> Array:
@@ -142,9 +142,7 @@ def evaluation(
         )
         numbers = measure_squares(grid, squares, of_eta, of_x, judged, of_norms)
         if level is not None:
-            k = np.clip(last, 0, max(len(grid) - 2, 0)).astype(np.intp)
-            before, after = errors(eta, k), errors(eta, np.minimum(k + 1, len(grid) - 1))
-            times = settled(grid, last, np.abs(before), np.abs(after), level)
+            times = settled(grid, last, lambda at: np.abs(errors(eta, at)), level)
             times[np.isnan(np.hstack([of_eta, of_x]))] = np.nan
             times[:, :p][:, ~judged] = np.nan
             numbers = np.concatenate([numbers, times.T])

@@ -295,22 +295,20 @@ def warnings(observation: Observed) -> tuple[str, ...]:
 
     Assumption 1 that fails on the form chosen, signals that errors spoil, and Φ that grows too far.
     """
-    found = tuple(
+    found = [
         str(a.evidence["because"]) for a in observation.assumptions
         if not a.holds and "because" in a.evidence
-    )
+    ]
     if observation.error_estimate > _SPOILT:
-        text = (
+        found.append(
             f"errors of the observer's signals grow to {observation.error_estimate:.1e} of their "
             "size: estimates are no better; use a shorter time.horizon, or another observer.form"
         )
-        found = (*found, text)
     growth, rate = observation.growth, observation.growth_rate
-    if growth is None or rate is None or growth < _GROWTH:
-        return found
-    text = (
-        f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
-        f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
-        "reset or current_coordinates; observer.form=strangeness_free feeds no output back"
-    )
-    return (*found, text)
+    if growth is not None and rate is not None and not growth < _GROWTH:
+        found.append(
+            f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
+            f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
+            "reset or current_coordinates; observer.form=strangeness_free feeds no output back"
+        )
+    return tuple(found)

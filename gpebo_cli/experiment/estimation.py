@@ -39,7 +39,7 @@ from gpebo_cli.experiment.uncertainty import (
     standard_deviations,
 )
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
-from gpebo_cli.findings import Requirement, replaced
+from gpebo_cli.findings import replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
@@ -390,38 +390,31 @@ def _estimate(
     explaining = parameters[:, -1].copy()
     parameters[..., np.isnan(told[0])] = np.nan
     estimated[..., np.isnan(told[1])] = np.nan
+
+    def doubted() -> tuple[Mapping[str, float], tuple[str, ...]]:
+        """Those of the final estimates; after resets, by the data since the last of them."""
+        since, by, visibly, end = regression.segments[-1], known, seen, kept[-1:]
+        if regression.resets:
+            by = assess(since, end, settings.excitation, settings.solver.tol).final
+            visibly = visible(replace(observation, regression=since), end, system.states)(by)[-1]
+        states, last = (
+            lambda eta, t=t: state_map.at(t)(eta[:, None].repeat(len(t), axis=1))
+            for t in (kept, end)
+        )
+        return doubts.of_estimates(
+            since.root, explaining, states, last, [*since.parameters, *system.states],
+            np.concatenate(sizes), by, visibly, columns, requirement,
+        )
+
     result = EstimationResult(
         cases=estimator.cases, t=kept, names=observation.parameters, parameters=parameters,
         true_parameters=truth[chosen], states=estimated, delta=lambda: plain.delta(kept),
         checks=state_map.checks(kept, estimated), requirement=requirement, explaining=explaining,
         active=held.active if held else {},
-        doubts=(lambda: _doubts(
-            settings, system, observation, explaining, kept, np.concatenate(sizes), known, seen,
-            columns, requirement,
-        )) if about_own and _one_fit(observation) else ({}, ()),
+        doubts=doubted if about_own and _one_fit(observation) else ({}, ()),
         still=doubts.still(parameters, requirement, natural),
     )
     return result, accuracy.metrics_of(numbers, observation.parameters, system)
-
-
-def _doubts(
-    settings: Settings, system: DescriptorSystem, observation: Observation, final: Array, t: Array,
-    sizes: Array, known: Knowledge, seen: BoolArray, columns: IntArray, requirement: Requirement,
-) -> tuple[Mapping[str, float], tuple[str, ...]]:
-    """Those of the ``final`` η̂ (G, p); after resets, by the data since the last of them."""
-    regression, state_map = observation.regression.segments[-1], observation.state_map
-    if observation.regression.resets:
-        since = replace(observation, regression=regression)
-        known = assess(regression, t[-1:], settings.excitation, settings.solver.tol).final
-        seen = visible(since, t[-1:], system.states)(known)[-1]
-
-    def states(t: Array) -> Callable[[Array], Array]:
-        return lambda eta: state_map.at(t)(eta[:, None].repeat(len(t), axis=1))
-
-    return doubts.of_estimates(
-        regression.root, final, states(t), states(t[-1:]),
-        [*regression.parameters, *system.states], sizes, known, seen, columns, requirement,
-    )
 
 
 def _estimates(

@@ -96,13 +96,8 @@ class SampledMesh:
 
     @property
     def first(self) -> IntArray:
-        """The element that starts at each instant, shape (samples,)."""
-        return np.searchsorted(self.sample, np.arange(self.count))
-
-    @property
-    def count(self) -> int:
-        """Number of samples within the horizon."""
-        return int(self.sample[-1]) + 1
+        """The element that starts at each instant within the horizon, shape (samples,)."""
+        return np.searchsorted(self.sample, np.arange(self.sample[-1] + 1))
 
 
 def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
@@ -157,13 +152,9 @@ def draw_errors(
     N is odd and there is at least one sample beyond the horizon, for the interpolant: outputs
     count as constant from its end on.
     """
-    count = grid.count + 1
-    count += 1 - count % 2
-    generator = np.random.default_rng(seed)
-    y = np.concatenate([
-        outputs.values[grid.first, 0],
-        np.broadcast_to(outputs.final, (count - grid.count, len(levels.outputs))),
-    ])
+    y, generator = outputs.values[grid.first, 0], np.random.default_rng(seed)
+    count = len(y) + 1 + len(y) % 2
+    y = np.concatenate([y, np.broadcast_to(outputs.final, (count - len(y), y.shape[1]))])
     drawn = levels.outputs * generator.standard_normal((count, len(levels.outputs)))
     of_inputs = levels.inputs * generator.standard_normal((count, len(levels.inputs)))
     steps = levels.steps

@@ -92,23 +92,19 @@ class Online:
 
     def __init__(
         self, settings: Settings, system: DescriptorSystem, hold: Hold, start: float, sample: Array,
-        estimator: estimators.Estimator | None = None,
-        deviations: SampledDeviations | None = None,
-        derivatives: InputDerivatives | None = None,
-        columns: IntArray | None = None,
+        estimator: estimators.Estimator, deviations: SampledDeviations | None = None,
+        derivatives: InputDerivatives | None = None, columns: IntArray | None = None,
     ) -> None:
         """Prepare for samples of which the first, [u; y] (m + r,), is at ``start``.
 
-        The estimator is used instead of the one that the settings name; ``deviations`` None: nobody
-        asks for them; ``derivatives`` are of the inputs, as far as they are known; of the
-        parameters ``columns`` (k,) are estimated, the others being zero; None: all.
+        With ``deviations`` None nobody asks for them; ``derivatives`` are of the inputs, as far as
+        they are known; of the parameters ``columns`` (k,) are estimated, the others being zero;
+        None: all.
         """
         self._observer = observers.able(
             observers.build(settings.observer), observers.AtSamples,
             "observer.sample_time and streams need an observer that runs at samples",
         ).at_samples(system, settings.solver, hold, start, sample, derivatives)
-        if estimator is None:
-            estimator = estimators.build(settings.estimator)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
         self.parameters = self._observer.parameters
         self._columns = np.arange(len(self.parameters)) if columns is None else columns
@@ -256,10 +252,8 @@ class Online:
     @property
     def natural_sizes(self) -> Array:
         """√(∫Y²/∫ψ_j²) so far, (p,): the size of a parameter that alone would explain Y."""
-        size = np.linalg.norm(self.root, axis=0)
-        return np.asarray(np.divide(
-            size[-1], size[:-1], out=np.zeros(len(size) - 1), where=size[:-1] > 0.0
-        ))
+        *own, of_Y = np.linalg.norm(self.root, axis=0)
+        return np.array([of_Y / size if size > 0.0 else 0.0 for size in own])
 
     def doubts(
         self, sizes: Array | None = None, columns: IntArray | None = None

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from time import perf_counter
-from typing import Self
 
 import numpy as np
 
@@ -35,17 +34,10 @@ from gpebo_cli.settings import Settings
 
 
 class Stage(str):
-    """The name of a stage that has got on: ``share`` of it is done."""
+    """The name of a stage that has got on."""
 
     __slots__ = ("share",)
-
-    def __new__(cls, name: str, share: float) -> Self:
-        """A name with a share of 0 to 1."""
-        stage = super().__new__(cls, name)
-        stage.share = share
-        return stage
-
-    share: float
+    share: float  # of it that is done, 0 to 1
 
 
 @contextmanager
@@ -58,7 +50,9 @@ def _timed(
 
     def getting_on(share: float) -> None:
         if share < 1.0:
-            progress(Stage(name, share))
+            stage = Stage(name)
+            stage.share = share
+            progress(stage)
 
     yield lambda count, what: paced(count, what, limit, getting_on)
     seconds[name] = perf_counter() - since

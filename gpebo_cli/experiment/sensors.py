@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
@@ -53,35 +54,25 @@ def candidates(settings: Settings, system: DescriptorSystem) -> list[Sensor]:
     if build(settings.observer) is None or settings.data.name == "csv" or system.regression:
         raise ConfigError("sensors=all needs a simulation of a plant (data=none) and an observer")
     rows = _Rows(settings, system)
-    base, n = rows.found(()), system.n
+    (base, _), n = rows.found(()), system.n
     chosen: list[int] = []
     out = []
     while len(chosen) < n:
         tried = {i: rows.found((*chosen, i)) for i in range(n) if i not in chosen}
-        best = max(tried, key=lambda i: (len(tried[i].deviations), tried[i].log_det))
+        best = max(tried, key=lambda i: (len(tried[i][0]), tried[i][1]))
         chosen.append(best)
-        alone, together = rows.found((best,)), tried[best]
+        (alone, _), (together, log_det) = rows.found((best,)), tried[best]
         out.append(Sensor(
-            system.states[best], tuple(alone.deviations),
-            tuple(name for name in alone.deviations if name not in base.deviations),
-            together.log_det,
-            _fall(base, alone), _fall(base, together),
+            system.states[best], tuple(alone), tuple(name for name in alone if name not in base),
+            log_det, _fall(base, alone), _fall(base, together),
         ))
     return out
 
 
-@dataclass(frozen=True)
-class _Found:
-    """What a choice of outputs determines."""
-
-    deviations: Mapping[str, float]  # in one unit for all choices
-    log_det: float
-
-
-def _fall(before: _Found, after: _Found) -> float:
+def _fall(before: Mapping[str, float], after: Mapping[str, float]) -> float:
     """By how much deviations fall."""
-    ratios = [before.deviations[name] / after.deviations[name] for name in before.deviations
-              if min(before.deviations[name], after.deviations.get(name, 0.0)) > 0.0]
+    ratios = [before[name] / after[name] for name in before
+              if min(before[name], after.get(name, 0.0)) > 0.0]
     # No row takes information away: what is less than 1 is rounding.
     return float(np.exp(np.log(np.maximum(ratios, 1.0)).mean())) if ratios else 1.0
 
@@ -119,8 +110,11 @@ class _Rows:
         gram = self._gram + self._more[list(chosen)].sum(axis=0)
         return knowledge(gram[None], self._terms, self._elapsed, self._solver.tol)
 
-    def found(self, chosen: Sequence[int]) -> _Found:
-        """With some states as further outputs, by their places."""
+    def found(self, chosen: Sequence[int]) -> tuple[Mapping[str, float], float]:
+        """Deviations of what is determined with some states as further outputs, and log det G.
+
+        They are in one unit for all choices of states, which come by their places.
+        """
         known = self._known(chosen)
         V, spectrum, sizes = known.vectors[0], known.eigenvalues[0], known.sizes[0]
         seen = spectrum >= known.level[0].max(initial=0.0)
@@ -133,8 +127,6 @@ class _Rows:
         names = (*self._parameters, *self._system.states)
         log_det = float(np.log(np.maximum(spectrum, _TINY)).sum()
                         + 2.0 * np.log(sizes / self._common).sum())
-        return _Found(
-            {name: float(d) for name, d, is_known in zip(names, deviations, which, strict=True)
-             if is_known}, log_det,
-        )
+        each = zip(names, deviations.tolist(), strict=True)
+        return dict(compress(each, which)), log_det
 

@@ -24,7 +24,7 @@ from gpebo_cli.numerics.mesh import SHARE, Mesh
 from gpebo_cli.numerics.problem import LinearProblem
 
 EPS = float(np.finfo(float).eps)
-_TINY = float(np.finfo(float).tiny)
+TINY = float(np.finfo(float).tiny)
 _SIGNS = 3  # choices of them for each kind of error
 CHANCE = 4.0  # by how much a sum of independent errors may exceed its root mean square
 END = 8.0  # units in the last place of what an end value is made of, lost in solving an element
@@ -81,7 +81,7 @@ def estimated_errors(
     rates = noise[..., :n] / mesh.steps[:, None, None]
     noise = kept * noise
     of_all, of_time = noise[..., : n + columns], noise[..., n + columns :]
-    of_all[..., n:] += instants + _TINY / EPS * values[:, 0].any(axis=0)  # what underflows
+    of_all[..., n:] += instants + TINY / EPS * values[:, 0].any(axis=0)  # what underflows
     if (np.abs(rates - rates[0]) <= _SAME * rates[0]).all():
         # Rounding of what is constant may be wrong in the same direction each time; that of times
         # is not, and comes with the share that the bound for all elements before has of this.
@@ -129,19 +129,17 @@ def judged_errors(
         total = largest + tail + noise + EPS * (VALUE * own + through)
         if problem.units is None:
             scale = np.maximum(np.maximum(own, problem.floor), SHARE * own.max(initial=0.0))
-            beside = scale = np.maximum(scale, _TINY)
+            beside = scale = np.maximum(scale, TINY)
         else:
             # Rounding that constraints amplify is no size to compare with: it is the error itself.
             coupled = np.maximum(made_of, problem.floor)
-            scale = np.maximum(np.where(own > NOTHING * coupled, own, coupled), _TINY)
+            scale = np.maximum(np.where(own > NOTHING * coupled, own, coupled), TINY)
             beside = np.maximum(scale, problem.units * (own / problem.units).max(initial=0.0))
         # A state that is nothing beside the others is not lost: there is nothing to be known of it.
         known = np.maximum(scale, _FAINT * own.max(initial=0.0))
         if problem.units is not None:
             known = np.where(scale <= NOTHING * through, np.maximum(known, through), known)
-        lost = len(carried)
-        if not (largest < known).all():
-            lost = int(np.argmin((carried < known).all(axis=(1, 2))))
+        lost = int(np.argmin(np.append((carried < known).all(axis=(1, 2)), False)))
     return Errors(total, scale, beside, lost, carried[-1])
 
 

@@ -104,7 +104,7 @@ def products_of_others(factors: Array) -> Array:
 def determinant_and_adjugate_action(
     omega: Array, rhs: Array | None = None
 ) -> tuple[Array, Array, Array]:
-    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p) or (..., p, c), singular Ω too.
+    """det(Ω) and adj(Ω) b for square Ω (..., p, p) and b (..., p, c), singular Ω too.
 
     Without b it is adj(Ω) itself. With Ω = U Σ Vᵀ, adj(Ω) = det(U) det(V) V diag(∏_{j≠i} σ_j) Uᵀ.
     The usual det(Ω)·inv(Ω) is rejected: it is undefined at the start, where every extension begins
@@ -117,9 +117,7 @@ def determinant_and_adjugate_action(
     sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
     others = products_of_others(sigma)
     determinant = sign * others[..., -1] * sigma[..., -1]
-    columns = rhs if rhs.ndim == omega.ndim else rhs[..., None]
-    coordinates = (transpose(u) @ columns) * others[..., None]
-    action = (sign[..., None, None] * (transpose(vt) @ coordinates)).reshape(rhs.shape)
+    action = sign[..., None, None] * (transpose(vt) @ ((transpose(u) @ rhs) * others[..., None]))
     largest = sigma[..., 0]
     reciprocal = np.divide(sigma[..., -1], largest, out=np.zeros_like(largest), where=largest > 0)
     return determinant, action, reciprocal

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
+from itertools import pairwise
 from math import factorial, prod
 from typing import Any, NamedTuple
 
@@ -92,27 +93,20 @@ class Mesh:
         """Element lengths, shape (K,)."""
         return np.asarray(self.edges[1:] - self.edges[:-1])
 
-    @property
+    @cached_property
     def points(self) -> Array:
         """Left end and nodes of every element, shape (K, s + 1)."""
-        return self._places[0]
-
-    @property
-    def inside(self) -> Array:
-        """Where functions that jump are decided, shape (K, s + 1)."""
-        return self._places[1]
-
-    @cached_property
-    def _places(self) -> tuple[Array, Array]:
-        """Points, and where functions that jump are decided."""
         points = self.edges[:-1, None] + self.steps[:, None] * self.rule.points
         points[:, -1] = self.edges[1:]
-        inside = points.copy()
+        return self.origin + points if self.origin else points
+
+    @cached_property
+    def inside(self) -> Array:
+        """Where functions that jump are decided, shape (K, s + 1)."""
+        inside = self.points.copy()
         inside[:, 0] += _INSIDE * self.steps
         inside[:, -1] -= _INSIDE * self.steps
-        if self.origin:
-            points, inside = self.origin + points, self.origin + inside
-        return points, inside
+        return inside
 
     def trajectory(self, flat: Array) -> Trajectory:
         """The signal (K, s + 1, …) with these values, one point after the other."""
@@ -188,14 +182,13 @@ class Sampler:
         flat = _flat(values)
         columns = flat.shape[2]
         wide = columns > _WIDE and columns * len(self.element) >= _MANY
-        grouped = self._grouped if wide else None
-        if grouped is None:
-            sampled = signals.sample(self.element, self.weights, flat)
-        else:
+        # One product for each element gathers nothing for each time.
+        if wide and 2 * len(self._runs) <= len(self.element):
             sampled = np.empty((len(self.element), columns))
-            for element, first, last in grouped:
-                some = slice(first, last)
-                np.matmul(self.weights[some], flat[element], out=sampled[some])
+            for k, some in self._runs:
+                np.matmul(self.weights[some], flat[k], out=sampled[some])
+        else:
+            sampled = signals.sample(self.element, self.weights, flat)
         return sampled.reshape(len(sampled), *values.shape[2:])
 
     def products(self, values: Array, factors: Array) -> Array:
@@ -203,31 +196,24 @@ class Sampler:
 
         Matrices of whole elements are multiplied: none is interpolated.
         """
-        changes, point = np.flatnonzero(np.diff(self.element)) + 1, self.weights.argmax(axis=1)
         found = np.empty((len(factors), values.shape[2]))
-        for some in np.split(np.arange(len(factors)), changes):
-            matrices, weights = values[self.element[some[0]]], self.weights[some]
+        for k, some in self._runs:
+            matrices, weights, own = values[k], self.weights[some], factors[some]
             there = weights.max(axis=1) == 1.0
-            at, between = some[there], some[~there]
-            if len(at):  # at points of the mesh, which follow each other
-                own = matrices[point[at[0]] : point[at[-1]] + 1]
-                own = own if len(own) == len(at) else matrices[point[at]]
-                found[at] = np.matmul(own, factors[at][..., None])[..., 0]
-            each = matrices @ factors[between].T
-            found[between] = np.einsum("mj,jnm->mn", weights[~there], each)
+            if there.any():  # at points of the mesh, which follow each other
+                point = weights[there].argmax(axis=1)
+                whole = matrices[point[0] : point[-1] + 1]
+                whole = whole if len(whole) == len(point) else matrices[point]
+                found[some][there] = np.matmul(whole, own[there][..., None])[..., 0]
+            each = matrices @ own[~there].T
+            found[some][~there] = np.einsum("mj,jnm->mn", weights[~there], each)
         return found
 
     @cached_property
-    def _grouped(self) -> list[tuple[int, int, int]] | None:
-        """Where several times in a row share elements: these, and the first and last of the times.
-
-        Then there is one product for each element, and nothing is gathered for each time.
-        """
-        changes = np.append(np.flatnonzero(np.diff(self.element)) + 1, len(self.element))
-        if 2 * len(changes) > len(self.element):
-            return None
-        ends, elements = changes.tolist(), self.element[changes - 1].tolist()
-        return list(zip(elements, [0, *ends[:-1]], ends, strict=True))
+    def _runs(self) -> list[tuple[int, slice]]:
+        """The element that some times in a row share, and which times these are."""
+        changes = np.flatnonzero(np.diff(self.element, prepend=-1, append=-1)).tolist()
+        return [(self.element[first], slice(first, last)) for first, last in pairwise(changes)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -429,12 +415,7 @@ def initial_edges(
 ) -> Array:
     """The edges (K + 1,) of :func:`initial_mesh`, with breakpoints (B,) among them."""
     if not len(breakpoints):
-        # The same numbers as np.linspace without its end.
-        edges: Array = np.arange(elements + 1, dtype=np.float64)
-        edges *= (stop - start) / elements
-        edges += start
-        edges[-1] = stop
-        return edges
+        return np.linspace(start, stop, elements + 1)
     cuts = np.unique(np.concatenate([[start], np.asarray(breakpoints, dtype=float), [stop]]))
     cuts = cuts[(cuts >= start) & (cuts <= stop)]
     counts = np.maximum(1, np.rint(elements * np.diff(cuts) / (stop - start))).astype(int)

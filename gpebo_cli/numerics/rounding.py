@@ -10,7 +10,7 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.errors import random_signs
+from gpebo_cli.numerics.errors import TINY, random_signs
 from gpebo_cli.numerics.linalg import inverse_or_none, largest_within
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
@@ -19,7 +19,6 @@ _MUCH = 1e3  # roundings of the largest value, from which on it is worth while t
 _FAST = 100.0  # a rate times the length of an element in which little would be forgotten below
 _GROWING = 8.0  # times the share of an element that is over: no swing that is resolved averages it
 _AT_ONCE = 256  # elements
-_TINY = float(np.finfo(float).tiny)
 
 
 def noise_of(h: Array, t: Array, c: LinearEquation) -> Array:
@@ -85,10 +84,10 @@ def kept_share(problem: LinearProblem, mesh: Mesh, noise: Array, values: Array) 
         h, t = mesh.steps[some], mesh.points[some]
         c = problem.coefficients(t.ravel(), mesh.inside[some].ravel())
         squares, terms = np.square(_responses(mesh, h, c)).mean(axis=2), _of_terms(h, t, c)
-        unit = max(float(sizes[some].max()), _TINY)  # squares of what grows are no numbers
+        unit = max(float(sizes[some].max()), TINY)  # squares of what grows are no numbers
         terms[..., values.shape[2] :] /= unit
         left = np.sqrt(squares @ moved(np.square(terms), np.square(sizes[some] / unit)))
-        part = left / np.maximum(most[some] / unit, _TINY)
+        part = left / np.maximum(most[some] / unit, TINY)
         share[some] = np.minimum(part, 1.0).max(axis=2, keepdims=True)
     return share
 

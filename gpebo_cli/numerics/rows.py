@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray
 
 _PAUSE = 5.0  # times the median step: a longer one is a pause,
 _RARE = 100.0  # unless one in so many files has it by the chance of its uneven rows
@@ -40,13 +40,15 @@ class Rows(NamedTuple):
 
         What lines make of an error beside a time has a part in the steps on both sides.
         """
+        steps = np.diff(self.t)
+        if self.lines:
+            beside = np.pad(steps, 1, "edge")
+            steps = 0.25 * (beside[:-2] + 2.0 * steps + beside[2:])
         row = np.searchsorted(self.t, t, side="right") - 1
+        return np.asarray(steps[row.clip(0, len(steps) - 1)])
 
-        def steps(row: IntArray) -> Array:
-            k = row.clip(0, len(self.t) - 2)
-            return np.asarray(self.t[k + 1] - self.t[k])
 
-        if not self.lines:
-            return steps(row)
-        row = row.clip(0, len(self.t) - 2)
-        return 0.25 * (steps(row - 1) + 2.0 * steps(row) + steps(row + 1))
+def of_lines(t: Array) -> Array:
+    """∫ of what straight lines between times (N,) make of 1 at one of them and 0 at the others."""
+    half = 0.5 * np.diff(t)
+    return np.asarray(np.append(half, 0.0) + np.append(0.0, half))

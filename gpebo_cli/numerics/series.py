@@ -23,7 +23,7 @@ from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.collocation import LinearSolution, decoupled, unresolved_signals
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
-from gpebo_cli.numerics.errors import END, EPS, LEVEL, Errors, judged_errors, random_signs
+from gpebo_cli.numerics.errors import END, EPS, LEVEL, TINY, Errors, judged_errors, random_signs
 from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
@@ -39,7 +39,6 @@ _ROUGH = 0.02  # to which errors are carried
 _LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
 _DENSE = 0.3  # share of entries, from which on a matrix counts as full
 _WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
-_TINY = float(np.finfo(float).tiny)
 _AT_ONCE = 4  # elements of which all points are held, where errors are carried
 _FEW_COLUMNS = 4  # whose errors are carried one by one
 
@@ -228,7 +227,7 @@ def _series(
 
     With kicks only values at both ends of each element.
     """
-    size, of_f = np.maximum(largest_over_time(A.entries), _TINY), f.reshape(len(f), -1)
+    size, of_f = np.maximum(largest_over_time(A.entries), TINY), f.reshape(len(f), -1)
     largest, rule = largest_over_time(of_f), mesh.rule
     terms = _powers(_degrees(A.entries, size, rule, tol))
     decay = _largest_shares(terms, size)
@@ -367,7 +366,7 @@ def _errors(
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
     sizes = found.sizes
-    size, last = np.maximum(sizes, _TINY), found.looked.last
+    size, last = np.maximum(sizes, TINY), found.looked.last
     tail = predicted_tail(last, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what series leave out.
     units = np.ones((n, 1)) if problem.units is None else problem.units
@@ -376,7 +375,7 @@ def _errors(
     moved = (EPS + change * stiff) * found.moved
     added = tail * (tail / size) ** (0.5 - 0.5 / rule.stages) + EPS * END * found.made_of
     added += change * sizes if stiff else change * beside + moved
-    added += np.where(sizes.max(axis=0) > 0.0, _TINY, 0.0)  # what decays to nothing is lost
+    added += np.where(sizes.max(axis=0) > 0.0, TINY, 0.0)  # what decays to nothing is lost
     start = EPS * np.abs(values[0, 0])
     noise = np.zeros((n, columns))
     if points > 4:

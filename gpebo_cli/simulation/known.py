@@ -21,7 +21,6 @@ from gpebo_cli.numerics.mesh import (
     Kind,
     Mesh,
     initial_edges,
-    initial_mesh,
     legendre_tail,
     unresolved,
     unresolved_kinds,
@@ -51,9 +50,8 @@ def first_mesh(
     """A mesh without anything narrow between its nodes, jumps (B,), and whether that is sure."""
     start, stop = time.start, time.start + time.horizon
     cuts = system.coefficients.breakpoints(start, stop)
-    mesh = initial_mesh(start, stop, cuts, FIRST_ELEMENTS, radau_rule(solver.stages))
-    edges, bounded = system.coefficients.resolved(mesh.edges)
-    return Mesh(edges, mesh.rule), cuts, bounded
+    edges, bounded = system.coefficients.resolved(initial_edges(start, stop, cuts))
+    return Mesh(edges, radau_rule(solver.stages)), cuts, bounded
 
 
 def few_elements(system: DescriptorSystem, mesh: Mesh, cuts: Array, longest: float) -> Mesh:
@@ -123,11 +121,8 @@ def cut_where(
     missed: Array | float = 0.0  # cuts in a row without effect
     while True:
         tail = tail_of(mesh, known)
-        poor = tail > tol
-        if not poor.any():
-            return mesh, known
         missed = np.where(tail < 0.25 * before, 0.0, missed + 1.0)
-        poor &= (missed < np.where(tail > 1e-6, _CUTS, 1)) & (tail > mesh.blur)
+        poor = (tail > tol) & (tail > mesh.blur) & (missed < np.where(tail > 1e-6, _CUTS, 1))
         parts = wanted_parts(tail, poor, tol, mesh.rule.stages)
         too_short = mesh.steps[poor] < 1e-6 * (mesh.edges[-1] - mesh.edges[0]) / mesh.size
         if not poor.any() or too_short.any() or parts.sum() > max_elements:

@@ -16,7 +16,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, Coefficients, Descripto
 from gpebo_cli.model.entries import Entries, entries
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
-from gpebo_cli.numerics.errors import EPS, NOTHING, VALUE
+from gpebo_cli.numerics.errors import EPS, NOTHING, TINY, VALUE
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
     SHARE,
@@ -60,7 +60,6 @@ _ENTRIES = 4  # per row of E; with more of them E counts as full
 _LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
 _SOME = 5  # at every so many points it is seen how fast states move
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
-_TINY = float(np.finfo(float).tiny)
 
 
 def forcing(found: Entries) -> Row:
@@ -74,14 +73,6 @@ def forcing(found: Entries) -> Row:
                 term = product(value, signal)
                 f[i] = f[i] + term if i in f else term
     return f
-
-
-def _placed(found: Entries, name: str, size: int) -> Array:
-    """A vector of the model, (orders, N or 1, size)."""
-    values = getattr(found.values, name)
-    out = np.zeros((*values.shape[:2], size))
-    out[:, :, found.places[name][0]] = values[:, :, found.which(name)]
-    return out
 
 
 class _Plant:
@@ -183,11 +174,9 @@ def large_simulation(
     """:func:`gpebo_cli.simulation.simulate.simulate`, or None where elimination or series fail."""
     mesh, cuts, bounded = first_mesh(system, time, solver)
     plant = _Plant(system, solver.max_strangeness_index + 1)
-    try:
-        with np.errstate(all="ignore"):
-            return _simulated(plant, mesh, cuts, solver, bounded=bounded)
-    except (UndecidedError, RoundingError):
-        return None
+    with np.errstate(all="ignore"), suppress(UndecidedError, RoundingError):
+        return _simulated(plant, mesh, cuts, solver, bounded=bounded)
+    return None
 
 
 def structure_of(
@@ -223,10 +212,10 @@ def _simulated(
     if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
         return None  # what jumps then is for the derivative array to say
     M, units = form.matrix, form.units
-    shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), _TINY)
+    shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), TINY)
     stiff = bool(np.ceil(mesh.steps / longest).sum() > series.MOST_ELEMENTS)
     if stiff:
-        longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), _TINY)
+        longest = SHORT / max(M.growth(units, SHORT / float(mesh.steps.max())), TINY)
 
     used = plant.found.places["u"][0]
     beside = _beside_inputs(plant.found, np.abs(system.initial_state), system.m)[used]
@@ -303,10 +292,9 @@ def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
     points = z.shape[:2]
     N = points[0] * points[1]
     x = plant.form.states_from(z.reshape(N, -1, 1))[:, :, 0]
-    u, theta = (
-        np.broadcast_to(_placed(found, name, size)[0], (N, size))
-        for name, size in (("u", system.m), ("theta", system.q))
-    )
+    u, theta = np.zeros((N, system.m)), np.zeros((N, system.q))
+    for name, signal in (("u", u), ("theta", theta)):
+        signal[:, found.places[name][0]] = getattr(found.values, name)[0][:, found.which(name)]
     y = np.zeros((system.r, N))
     for name, signal in (("C", x), ("D", u), ("H", theta)):
         for (i, j), value in found.of(name).items():
@@ -349,10 +337,10 @@ def _result(
     form, (x, y, u) = plant.form, _signals(plant, z)
     own_z, own = np.abs(z).max(axis=(0, 1)), np.abs(x).max(axis=(0, 1))
     made_of = np.maximum(form.sizes_from(own_z)[:, 0] + form.known, own)
-    tail = legendre_tail(x, mesh.rule, np.maximum(np.abs(x).max(axis=1), _TINY)).max(axis=0)
+    tail = legendre_tail(x, mesh.rule, np.maximum(np.abs(x).max(axis=1), TINY)).max(axis=0)
     wrong = form.sizes_from(solution.errors * own_z)[:, 0] + tail
     wrong += VALUE * EPS * form.loss * made_of
-    scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), _TINY)
+    scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), TINY)
     state_errors = wrong / scale
     at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((0, len(x0)))
     jumps = [(float(mesh.edges[k]), x[k - 1, -1], Jump(x[k, 0], none)) for k in at]

@@ -13,7 +13,7 @@ from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
 from gpebo_cli.model.text import FollowsSignals, blur_of
 from gpebo_cli.numerics.collocation import solve
-from gpebo_cli.numerics.errors import EPS, NOTHING, least_sizes, nothing_left
+from gpebo_cli.numerics.errors import EPS, NOTHING, TINY, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -38,7 +38,6 @@ _SHARES = np.linspace(0.0, 1.0, 9)  # of the horizon, where numbers may be too l
 _LOOKED_AT = 32  # times at which the mixing of states is looked at
 _MOST_ALIKE, _LOOKED_AT_FOR_GROWTH = 6000, 2000  # elements: more are cut only where it grows
 _MOST_FOR_GROWTH = 1 << 26  # numbers; beyond them elements are cut only where that is seen to help
-_TINY = float(np.finfo(float).tiny)
 _AT_ONCE = 128  # elements of which all equations are held
 _LOOKS = 4  # at what entries do along a solution that is found closer and closer
 _LITTLE = 1e-11  # of a state: rounding of constraints of which a bound is below is not looked at
@@ -73,7 +72,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         if structure.growth > growth:
             return None
         with np.errstate(all="ignore"):  # an iterate need not be finite
-            last[:] = [_solved(linear, window, settings, structure)]
+            last[:] = [_simulate_linear(linear, window, settings, structure)]
         return last[0].signals.states
 
     plant, source, before = system, cast(FollowsSignals, system.coefficients), None
@@ -105,16 +104,11 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
 
 
 def _simulate_linear(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings
+    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings,
+    structure: Structure | None = None,
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
-    return _solved(system, time, solver, dense_structure(system, time, solver))
-
-
-def _solved(
-    system: DescriptorSystem, time: TimeSettings, solver: SolverSettings, structure: Structure
-) -> Simulation:
-    """:func:`_simulate_linear` of a plant with this structure."""
+    structure = structure or dense_structure(system, time, solver)
     start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
     # Of many elements some are looked at, and the equations are made where they are solved.
@@ -152,8 +146,8 @@ def _solved(
         u, C, direct = extras
         # An output may cancel identically (x1 − x2 of two equal states): it is resolved relative
         # to the states.
-        y = _outputs(C, values[..., 0], direct)
-        size = largest_over_time(values[..., 0], 2)
+        x = values[..., 0]
+        y, size = np.einsum("...ij,...j->...i", C, x) + direct, largest_over_time(x, 2)
         least = least_sizes(problem, size[:, None], solver.tol)[:, 0]
         least = largest_over_time(C, 2) @ least
         return [(u, SHARE * terms(size)), (y, least)]
@@ -188,7 +182,7 @@ def _solved(
     mesh = solution.trajectory.mesh
     x = solution.trajectory.values[..., 0]
     u, C, direct = solution.extras
-    y = _outputs(C, x, direct)
+    y = np.einsum("...ij,...j->...i", C, x) + direct
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
         structure=structure, initial_state=x0,
@@ -216,7 +210,7 @@ def _known_resolved(
     if solver.name == "ivp":
         c = evaluated(mesh)
         return mesh, c, _beside_inputs(c)
-    longest, first = SHORT / max(structure.rate, _TINY), float(mesh.steps.max())
+    longest, first = SHORT / max(structure.rate, TINY), float(mesh.steps.max())
     if first > longest:
         mesh = _growth_resolved(system, structure, mesh, solver)
     elif structure.steady and bounded and 2.0 * first <= longest:
@@ -313,10 +307,8 @@ def _amplification(form: StrangenessFree, units: Array, within: Array) -> Array:
 def _equations(reduced: StrangenessFree) -> LinearEquation:
     """The strangeness-free equations in the form that the collocation takes."""
     f1, extras = reduced.f1[:, :, None], (reduced.u, reduced.C, reduced.direct)
-    if not reduced.A2.shape[1]:
-        return LinearEquation(reduced.E1, reduced.A1, f1, extras, None, reduced.terms)
-    constraints = Constraints(reduced.basis, reduced.offset[:, :, None])
-    return LinearEquation(reduced.E1, reduced.A1, f1, extras, constraints, reduced.terms)
+    own = Constraints(reduced.basis, reduced.offset[:, :, None]) if reduced.A2.shape[1] else None
+    return LinearEquation(reduced.E1, reduced.A1, f1, extras, own, reduced.terms)
 
 
 def _restarts(
@@ -342,13 +334,3 @@ def _beside_inputs(c: Coefficients) -> Callable[[Array], Array]:
     A, B = (largest_over_time(distinct(matrix)[0]) for matrix in (c.A, c.B))
     i, j = B.nonzero()
     return lambda size: least_beside(A @ size, B[i, j], i, j, B.shape[1])
-
-
-def _outputs(C: Array, x: Array, direct: Array) -> Array:
-    """y = C x + direct at points (K, s + 1)."""
-    (K, points, n), r = x.shape, C.shape[2]
-    if C.shape[:2] == (1, 1):
-        y = (x.reshape(K * points, n) @ C[0, 0].T).reshape(K, points, r)
-    else:
-        y = np.matmul(C, x[..., None])[..., 0]
-    return np.asarray(y + direct)
