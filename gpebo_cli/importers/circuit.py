@@ -9,7 +9,6 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import chain, count
 from typing import Any
 
@@ -31,34 +30,11 @@ _TERM = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class Topology:
-    """What the graph of a circuit says of its index (Estévez Schwarz and Tischendorf, 2000)."""
-
-    loops: tuple[tuple[str, ...], ...]  # of capacitors and at least one voltage source each
-    cutsets: tuple[tuple[str, ...], ...]  # of inductors and current sources each
-    decides: bool  # False with controlled sources, couplings or transformers: a bound no more
-
-    @property
-    def index(self) -> int:
-        """2 where there is a loop or a cutset, else at most 1."""
-        return 2 if self.loops or self.cutsets else 1
-
-    def __str__(self) -> str:
-        found = [f"loop of capacitors and voltage sources: {', '.join(x)}" for x in self.loops]
-        found += [f"cutset of inductors and current sources: {', '.join(x)}" for x in self.cutsets]
-        why = "; ".join(found) or (
-            "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
-        )
-        note = "" if self.decides else "; controlled sources and couplings may change it"
-        return f"index {self.index} by topology ({why}{note})"
-
-
 def circuit_from_netlist(
     text: str, name: str, file: str = "netlist", measure: str | Iterable[str] | None = None,
     unknown: str | Iterable[str] | None = None,
-) -> tuple[PlantDraft, Topology]:
-    """The descriptor system of a netlist (see ``from_netlist``), and what its topology says."""
+) -> PlantDraft:
+    """The descriptor system of a netlist, see ``from_netlist``."""
     netlist = read_netlist(text, file)
     topology = examine(netlist, file)
     measured = split_names(measure)
@@ -68,14 +44,16 @@ def circuit_from_netlist(
         builder.output(output)
     sources = {name: e.name for name, e in builder.elements.items()}
     draft.make_unknown(sources.get(word.lower(), word) for word in split_names(unknown))
-    draft.comments.append(str(topology))
-    return draft, topology
+    draft.comments.append(topology)
+    return draft
 
 
-def examine(netlist: Netlist, file: str) -> Topology:
-    """Loops and cutsets that raise the index.
+def examine(netlist: Netlist, file: str) -> str:
+    """What the graph says of the index (Estévez Schwarz and Tischendorf, 2000), in words.
 
-    A floating node, a loop or a cutset of independent sources alone is a ConfigError.
+    It is 2 where there is a loop or a cutset, else at most 1; with controlled sources, couplings or
+    transformers that is a bound no more (ConfigError: a floating node, a loop or a cutset of
+    independent sources alone).
     """
     from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
 
@@ -116,10 +94,15 @@ def examine(netlist: Netlist, file: str) -> Topology:
                 f"{e.name} drives a current that can flow back through current sources only; its "
                 "voltage would be anything"
             )
-    return Topology(
-        tuple(_loops(branches)), tuple(_cutsets(branches, joined("LIGF").subsets())),
-        all(e.kind in "RLCVIS" for e in netlist.elements),
+    cutsets = _cutsets(branches, joined("LIGF").subsets())
+    found = [f"loop of capacitors and voltage sources: {', '.join(x)}" for x in _loops(branches)]
+    found += [f"cutset of inductors and current sources: {', '.join(x)}" for x in cutsets]
+    why = "; ".join(found) or (
+        "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
     )
+    if not all(e.kind in "RLCVIS" for e in netlist.elements):
+        why += "; controlled sources and couplings may change it"
+    return f"index {2 if found else 1} by topology ({why})"
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
