@@ -23,7 +23,7 @@ from gpebo_cli.results.comparison import norm_panels
 from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
-from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset, unit_of
+from gpebo_cli.results.symbols import error_of, number_text, symbol, typeset, unit_of
 from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
@@ -174,8 +174,8 @@ def gram(result: RunResult) -> list[Panel]:
         return []
     t, eigenvalues = excitation.t, excitation.gram_eigenvalues
     curves = [
-        Curve(t, eigenvalues[:, i], f"λ{subscript(i + 1)}", line(i), rf"$\lambda_{{{i + 1}}}$")
-        for i in range(eigenvalues.shape[1])
+        Curve(t, values, symbol(f"lambda_{i + 1}"), line(i), rf"$\lambda_{{{i + 1}}}$")
+        for i, values in enumerate(eigenvalues.T)
     ]
     if (rho := excitation.rho) is not None:
         level = number_text(rho)
