@@ -145,10 +145,8 @@ def _cutsets(
     """Inductors and current sources around each part that nothing else connects to ground."""
     crossing = [e for e in branches if e.kind in "LIGF"]
     for part in sorted(parts, key=min):
-        if GROUND in part:
-            continue
-        sides = [[node in part for node in e.nodes[:2]] for e in crossing]
-        yield tuple(e.name for e, (a, b) in zip(crossing, sides, strict=True) if a != b)
+        if GROUND not in part:
+            yield tuple(e.name for e in crossing if (e.nodes[0] in part) != (e.nodes[1] in part))
 
 
 class _Builder:
