@@ -57,7 +57,7 @@ def examine(netlist: Netlist, file: str) -> str:
     """
     from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
 
-    branches = [e for e in netlist.elements if e.kind != "K"]
+    branches = [e for e in netlist.elements.values() if e.kind != "K"]
     nodes = {node for e in branches for node in e.nodes}
     if GROUND not in nodes:
         raise ConfigError(f"{file}: no element is connected to ground, which is the node 0")
@@ -100,7 +100,7 @@ def examine(netlist: Netlist, file: str) -> str:
     why = "; ".join(found) or (
         "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
     )
-    if not all(e.kind in "RLCVIS" for e in netlist.elements):
+    if not all(e.kind in "RLCVIS" for e in netlist.elements.values()):
         why += "; controlled sources and couplings may change it"
     return f"index {2 if found else 1} by topology ({why})"
 
@@ -153,13 +153,11 @@ class _Builder:
     """Stamps of the elements, row by row."""
 
     def __init__(self, netlist: Netlist, name: str, file: str, measured: Sequence[str]) -> None:
-        self.file = file
+        self.file, self.netlist = file, netlist
         # The plant does not depend on the order of the lines, nor do roundings of its solution.
-        elements = sorted(
-            netlist.elements, key=lambda e: (_ORDER.index(e.kind), _natural(e.name))
-        )
-        self.netlist = netlist
-        self.elements = {e.name.lower(): e for e in elements}
+        self.elements = dict(sorted(
+            netlist.elements.items(), key=lambda e: (_ORDER.index(e[1].kind), _natural(e[0]))
+        ))
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self._taken: set[str] = set()
