@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -247,7 +247,7 @@ def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[C
     groups: dict[str, list[Case]] = {}
     for case in relevant:
         folder = [case.run.partition("/")[0]] if twice else []
-        label = ", ".join(filter(None, [*folder, _words(case, others)]))
+        label = ", ".join(filter(None, [*folder, words(case.chosen, others)]))
         groups.setdefault(label, []).append(case)
     return groups
 
@@ -255,21 +255,18 @@ def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[C
 def _labels(cases: Sequence[Case], chosen: Sequence[Case]) -> list[str]:
     """The shortest name of each of those chosen that tells it from all others."""
     others, runs = varying(cases), {case.run for case in cases}
-    if len({_words(case, others) for case in cases}) == len(cases):
-        return [_words(case, others) for case in chosen]
+    if len({words(case.chosen, others) for case in cases}) == len(cases):
+        return [words(case.chosen, others) for case in chosen]
     if len(runs) == len(cases):
         others = []
-    parts = [[case.run if len(runs) > 1 else "", _words(case, others)] for case in chosen]
+    parts = [[case.run if len(runs) > 1 else "", words(case.chosen, others)] for case in chosen]
     return [", ".join(filter(None, each)) for each in parts]
 
 
-def _words(case: Case, chosen: Sequence[str]) -> str:
-    """``drem, γ = 10⁸``: names are left out where the value says it all."""
+def words(chosen: Mapping[str, Value], names: Iterable[str]) -> str:
+    """``drem, γ = 10⁸``, of what has these names: they are left out where the value says it all."""
     parts = []
-    for name in chosen:
-        value = case.chosen.get(name)
-        if value is None:
-            continue
+    for name, value in ((name, chosen[name]) for name in names if name in chosen):
         number = _as_number(value)
         if math.isfinite(number):
             parts.append(f"{symbol(name)} = {number_text(number)}")

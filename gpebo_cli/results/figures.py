@@ -19,7 +19,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.comparison import norm_panels
+from gpebo_cli.results.comparison import norm_panels, words
 from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
@@ -410,11 +410,7 @@ def _shown(result: RunResult, estimation: EstimationResult) -> list[tuple[str, i
     if not varying:
         name = str(result.settings.estimator.get("name", "estimate"))
         return [(name if count == 1 else f"{name}, case {case}", case) for case in chosen]
-    labels = (
-        ", ".join(f"{symbol(gain)} = {number_text(case[gain])}" for gain in varying if gain in case)
-        for case in cases
-    )
-    return list(zip(labels, chosen, strict=True))
+    return [(words(case, varying), k) for case, k in zip(cases, chosen, strict=True)]
 
 
 def _per_case(
