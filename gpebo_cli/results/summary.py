@@ -55,7 +55,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
         "parameters": None if estimation is None else dict(
             zip(estimation.names, estimation.true_parameters[-1], strict=True)
         ),
-        "estimates": _estimates(result),
+        "estimates": estimation and _estimates(result, estimation),
         "active_bounds": estimation and _active_bounds(estimation),
         "estimable": {name: since is not None for name, since in result.estimable.items()},
         "assumptions": [vars(assumption) for assumption in result.assumptions],
@@ -65,7 +65,7 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
             key: getattr(estimation.requirement, key)
             for key in ("name", "holds", "evidence", "text")
         },
-        "cases": _cases(estimation, result.metrics),
+        "cases": estimation and result.metrics and _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
             "by_state": by_state,
@@ -125,13 +125,10 @@ def _fit(fit: Fit) -> dict[str, Any]:
     }
 
 
-def _estimates(result: RunResult) -> object:
+def _estimates(result: RunResult, estimation: EstimationResult) -> object:
     """Every estimate at the end with its truth: of the one case, or of several by number."""
-    estimation = result.estimation
-    if estimation is None:
-        return None
     count = min(len(estimation.cases), MAX_LISTED_CASES)
-    cases = [estimates_at_end(result, k) for k in range(count)]
+    cases = [estimates_at_end(result, estimation, k) for k in range(count)]
     return cases[0] if len(cases) == 1 else {str(k): case for k, case in enumerate(cases)}
 
 
@@ -144,11 +141,10 @@ def _active_bounds(estimation: EstimationResult) -> list[dict[str, Any]] | None:
     ]
 
 
-def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
+def estimates_at_end(
+    result: RunResult, estimation: EstimationResult, case: int
+) -> dict[str, dict[str, Any]]:
     """By name: value, standard deviation, unit and truth at the end; what is unknown is None."""
-    estimation = result.estimation
-    if estimation is None:
-        return {}
     units = result.system.units
     kinds = (
         (estimation.names, estimation.parameters, estimation.parameters_std,
@@ -186,10 +182,8 @@ def _excitation(excitation: Excitation) -> dict[str, Any]:
     }
 
 
-def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:
+def _cases(estimation: EstimationResult, metrics: Metrics) -> object:
     """List the cases with gains and metrics; ranges of the metrics when they are many."""
-    if estimation is None or metrics is None:
-        return None
     columns = metrics.columns
     if len(estimation.cases) <= MAX_LISTED_CASES:
         return [
