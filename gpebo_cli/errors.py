@@ -14,8 +14,6 @@ _MOST = 2.0  # GB
 
 def printable(text: str) -> str:
     """The text on one line; what would command a terminal in it is written as it is in Python."""
-    if text.isprintable():
-        return text
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 

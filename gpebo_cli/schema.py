@@ -185,27 +185,28 @@ def convert(value: object, kind: Any, where: str) -> Any:
     """
     if kind is object or kind is Any:
         return value
-    origin, arguments = get_origin(kind), get_args(kind)
+    origin, arguments, hint = get_origin(kind), get_args(kind), ""
     if origin is Union or origin is types.UnionType:
-        return _alternative(value, kind, arguments, where)
-    if origin is Literal:
+        if value is None and type(None) in arguments:
+            return None
+        for alternative in arguments:
+            with suppress(ConfigError):  # the message below names all alternatives
+                return convert(value, alternative, where)
+    elif origin is Literal:
         if isinstance(value, str | bool | int) and value in arguments:
             return value
-        names = [str(name) for name in arguments]
-        raise ConfigError(
-            f"{where}: expected {_describe(kind)}, got {shown(value)}" + nearest(str(value), names)
-        )
-    if is_dataclass(kind):
+        hint = nearest(str(value), map(str, arguments))
+    elif is_dataclass(kind):
         return read(typing.cast("Any", kind), value, where)
-    if origin is not None:
-        return _collection(value, kind, where)
-    found = _scalar(value, kind)
-    if found is None:
-        raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
-    return found
+    else:
+        found = _scalar(value, kind) if origin is None else _collection(value, kind, where)
+        if found is not None:
+            return found
+    raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}{hint}")
 
 
 def _collection(value: object, kind: Any, where: str) -> Any:
+    """``value`` as a list or mapping, or None if it is not one of that kind."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin is list and isinstance(value, Sequence) and not isinstance(value, str):
         return [convert(v, arguments[0], f"{where}[{i}]") for i, v in enumerate(value)]
@@ -214,7 +215,7 @@ def _collection(value: object, kind: Any, where: str) -> Any:
             if not isinstance(key, str):
                 raise ConfigError(f"{where}: names must be text, got {shown(key)}")
         return {k: convert(v, arguments[1], f"{where}.{k}") for k, v in value.items()}
-    raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
+    return None
 
 
 def _scalar(value: object, kind: Any) -> Any:
@@ -229,15 +230,6 @@ def _scalar(value: object, kind: Any) -> Any:
     if kind is float:
         return found
     return int(found) if found == int(found) else None
-
-
-def _alternative(value: object, kind: Any, alternatives: Sequence[Any], where: str) -> Any:
-    if value is None and type(None) in alternatives:
-        return None
-    for alternative in alternatives:
-        with suppress(ConfigError):  # the message below names all alternatives
-            return convert(value, alternative, where)
-    raise ConfigError(f"{where}: expected {_describe(kind)}, got {shown(value)}")
 
 
 def _number(value: object) -> float | None:

@@ -24,7 +24,7 @@ from gpebo_cli.results.names import FIGURE_NAMES, METRICS
 
 
 def names(*words):
-    return [line.partition("\t")[0] for line in candidates(words, list(COMMANDS))]
+    return [line.partition("\t")[0] for line in candidates(words)]
 
 
 @pytest.fixture
@@ -56,13 +56,13 @@ def test_groups_and_their_values():
         on_disk = {f"{group}={path.as_posix()}" for path in files}
         assert set(names("run", f"{group}=")) == on_disk
     assert names("check", "plant=cir") == ["plant=circuit"]
-    (line,) = candidates(["run", "plant=cir"], [])
+    (line,) = candidates(["run", "plant=cir"])
     assert line == "plant=circuit\telectrical circuit with time-varying elements, index 2"
 
 
 @pytest.mark.parametrize("command", ["gpebo", "/usr/bin/gpebo", "x=1 gpebo", "another_name"])
 def test_a_line_begins_with_the_command_whatever_its_name(command, capsys):
-    assert answer(["--line", f"{command} compl"], list(COMMANDS)) == 0
+    assert answer(["--line", f"{command} compl"]) == 0
     assert capsys.readouterr().out.split("\t")[0].strip() == "completion"
 
 

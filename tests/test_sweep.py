@@ -436,12 +436,13 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
 
     def case(run, gain, error):
         metrics = dict.fromkeys(METRICS, error)
-        return Case(run, Path(run), 0, {"plant": "p"}, {"gamma": gain}, metrics)
+        return Case(run, Path(run), 0, {"plant": "p", "gamma": gain}, metrics)
 
     quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in range(3)]
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
     assert [curve.y.tolist() for curve in first.curves] == [[1e-9] * 3]
-    two = [replace(c, settings={"estimator": name}) for name in ("drem", "mre") for c in quiet]
+    two = [replace(c, chosen=c.chosen | {"estimator": name})
+           for name in ("drem", "mre") for c in quiet]
     legends = [panel.legend for panel in metric_panels(two, "gamma")]
     assert legends == [True, *[False] * (len(METRICS) - 1)]
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
@@ -452,7 +453,7 @@ def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():
     from gpebo_cli.results.finished import Case
 
     def labels(*of):
-        cases = [Case(run, Path(run), 0, {"estimator": name}, {"gamma": gain}, {})
+        cases = [Case(run, Path(run), 0, {"estimator": name, "gamma": gain}, {})
                  for run, name, gain in of]
         return _labels(cases, cases[1:])
 
@@ -471,8 +472,7 @@ def test_a_map_has_each_case_in_its_place():
     from gpebo_cli.results.finished import Case
 
     def cases(*places):
-        return [Case("r", Path("r"), 0, {}, {"a": a, "b": b}, {"rms": 10 * a + b})
-                for a, b in places]
+        return [Case("r", Path("r"), 0, {"a": a, "b": b}, {"rms": 10 * a + b}) for a, b in places]
 
     x, y, values = heat_grid(cases((2, 5), (1, 4), (2, 4)), "a", "b", "rms")
     assert (x.tolist(), y.tolist()) == ([1, 2], [4, 5])

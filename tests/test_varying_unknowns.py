@@ -132,7 +132,7 @@ def test_forgetting_follows_a_step_and_remembering_does_not(name):
     assert abs(remembering[-1] - 2.5) > 0.3
     truth = result.estimation.true_parameters[:, 0]
     assert (truth[before], truth[-1]) == (1.5, 2.5)
-    assert estimates_at_end(result, 1)["theta1"]["true"] == 2.5
+    assert estimates_at_end(result, result.estimation, 1)["theta1"]["true"] == 2.5
     # What is reported is the error of θ, not of the e₀ that makes up for its step.
     errors = np.abs(result.estimation.parameters - result.estimation.true_parameters)[:, -1, :2]
     assert result.metrics.final_error_parameters == pytest.approx(errors.max(axis=1), rel=1e-9)

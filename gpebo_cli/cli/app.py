@@ -122,7 +122,7 @@ def _dispatch(words: list[str]) -> int:
     if command == "__complete":  # asked by the scripts that `gpebo completion` prints
         from gpebo_cli.cli import completion
 
-        return completion.answer(rest, COMMANDS)
+        return completion.answer(rest)
     raise ConfigError(_unknown(command))
 
 

@@ -132,10 +132,9 @@ def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
     lines = [title]
     for a in found:
         lines.append(f"  {'holds' if a.holds else 'FAILS'}  {a.name:<{width}}  {a.statement}")
-        told = ("none" if v is None else v for v in a.evidence.values())
         evidence = ", ".join(
-            f"{key} {value:.4g}" if isinstance(value, float) else f"{key} {value}"
-            for key, value in zip(a.evidence, told, strict=True)
+            f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {'none' if v is None else v}"
+            for k, v in a.evidence.items()
         )
         lines += _wrapped(evidence, " " * (width + 11))
         if not a.holds and a.name in _ADVICE:

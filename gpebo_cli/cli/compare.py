@@ -42,8 +42,7 @@ def main(words: list[str]) -> int:
     metrics, best = shown_metrics(measured), ranking(measured)
     sort = arguments.values.get("--sort", best)
     known = comparison.names(cases)
-    given = arguments.values.get("--columns", "").split(",")
-    asked = list(filter(None, map(str.strip, given)))
+    asked = [n.strip() for n in arguments.values.get("--columns", "").split(",") if n.strip()]
     for option, name in (("--sort", sort), *(("--columns", name) for name in asked)):
         if name not in known:
             raise unknown(f"{option} {name}: no such column", name, known)
@@ -60,8 +59,7 @@ def main(words: list[str]) -> int:
         values = [row.get(name) for name in columns]
         return [value if isinstance(value, str) else cell(value, digits) for value in values]
 
-    shown = [cells(row, seen, 5) for row in rows[:_SHOWN_ROWS]]
-    lines = columns([seen, *shown])
+    lines = columns([seen, *(cells(row, seen, 5) for row in rows[:_SHOWN_ROWS])])
     if len(rows) > _SHOWN_ROWS:
         lines.append(f"… {len(rows) - _SHOWN_ROWS} more; --csv FILE has all")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
@@ -69,8 +67,7 @@ def main(words: list[str]) -> int:
     if "--csv" in arguments.values:
         path = Path(arguments.values["--csv"])
         make_folder(path.parent)
-        exact = [cells(row, known, 17) for row in rows]
-        write_text(path, csv_text([known, *exact]))
+        write_text(path, csv_text([known, *(cells(row, known, 17) for row in rows)]))
         sys.stdout.write(f"{path}\n")
     if "--no-figures" not in arguments.switches:
         from gpebo_cli.results.style import save
@@ -96,9 +93,7 @@ def _cases(name: str) -> list[Case]:
     for found in find(name):
         left_out = sum(record.status != "done" for record in found.records)
         if left_out:
-            total = len(found.records)
-            sys.stderr.write(
-                f"{found.path}: {left_out} of {total} jobs are not done and left out\n"
-            )
+            jobs = f"{left_out} of {len(found.records)} jobs"
+            sys.stderr.write(f"{found.path}: {jobs} are not done and left out\n")
         cases += found.cases
     return cases

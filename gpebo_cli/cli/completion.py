@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 
+from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.arguments import OPTIONS, VALUES
 from gpebo_cli.cli.listing import KINDS, described
 from gpebo_cli.cli.options import SHORT, VOLUME
@@ -52,11 +53,11 @@ def main(words: list[str]) -> int:
     return 0
 
 
-def answer(words: list[str], commands: Sequence[str]) -> int:
+def answer(words: list[str]) -> int:
     """Print the candidates for the last of ``words`` (perhaps empty), one a line; 0."""
     if words[:1] == ["--line"]:
         words = _split(" ".join(words[1:]))
-    for candidate in candidates(words or [""], commands):
+    for candidate in candidates(words or [""]):
         sys.stdout.write(f"{candidate}\n")
     return 0
 
@@ -70,17 +71,17 @@ def _split(line: str) -> list[str]:
     return words[(named[0] if named else 0) + 1 :]
 
 
-def candidates(words: Sequence[str], commands: Sequence[str]) -> list[str]:
+def candidates(words: Sequence[str]) -> list[str]:
     """What the last of the words after ``gpebo`` can become, with a description behind a tab."""
     *before, word = words
-    found = dict.fromkeys(_in_place(before, word, commands))
+    found = dict.fromkeys(_in_place(before, word))
     return [candidate for candidate in found if candidate.startswith(word)]
 
 
-def _in_place(before: Sequence[str], word: str, commands: Sequence[str]) -> Iterable[str]:
+def _in_place(before: Sequence[str], word: str) -> Iterable[str]:
     """All that can stand in the place of ``word``, some of it with another beginning."""
     if not before:
-        return [*commands, "--help", "--version"]
+        return [*COMMANDS, "--help", "--version"]
     command, *before = before
     last, (key, equals, _) = "".join(before[-1:]), word.partition("=")
     if last in _FOLDER_OPTIONS or (equals and key in (*_FOLDER_OPTIONS, *_SWEEP_FOLDERS)):
@@ -99,7 +100,7 @@ def _in_place(before: Sequence[str], word: str, commands: Sequence[str]) -> Iter
         "completion": SHELLS,
         "compare": METRICS if last == "--sort" else (),
     }
-    return [*found.get(command, ()), *(_options(command) if command in commands else ())]
+    return [*found.get(command, ()), *(_options(command) if command in COMMANDS else ())]
 
 
 def _options(command: str) -> list[str]:

@@ -101,8 +101,7 @@ class Loader(ConfigLoaderImpl):
                 f"the configuration cannot be composed: {error}; a choice is one name, a list is "
                 "given as a whole, as in plant.outputs=[y]"
             ) from error
-        plain = OmegaConf.to_container(config, resolve=False)
-        refuse_code(cast("dict[str, Any]", plain))
+        refuse_code(cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False)))
         return config
 
 
@@ -207,13 +206,11 @@ def show(hydra: Hydra, arguments: Arguments) -> bool:
     name, words = arguments.config_name, _words(arguments)
     options = arguments.given.values
     if "--hydra-help" in arguments.given.switches:
-        program = [f"{os.path.basename(sys.argv[0])} run", *words]
-        sys.argv = program  # the parser is called after it
+        sys.argv = [f"{os.path.basename(sys.argv[0])} run", *words]  # the parser is called after it
         parser = get_args_parser()
         hydra.hydra_help(name, parser, parser.parse_args(words))
     elif "--cfg" in options:
-        resolve = "--resolve" in arguments.given.switches
-        hydra.show_cfg(name, words, options["--cfg"], None, resolve)
+        hydra.show_cfg(name, words, options["--cfg"], None, "--resolve" in arguments.given.switches)
     elif "--info" in options:
         hydra.show_info(options["--info"], name, words)
     else:

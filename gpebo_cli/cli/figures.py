@@ -143,8 +143,7 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
     labels = [", ".join(each) for each in values]
     short = [", ".join(value.rpartition("/")[2] for value in each) for each in values]
     for label, words in zip(short if len({*short}) == len(short) else labels, jobs, strict=True):
-        config = loader.load_configuration(PRIMARY, [*overrides, *words], RunMode.RUN)
-        yield label, config
+        yield label, loader.load_configuration(PRIMARY, [*overrides, *words], RunMode.RUN)
 
 
 def run_recipe_job(cfg: DictConfig, arguments: Arguments, where: str) -> RunResult:

@@ -106,8 +106,7 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
-        reason = getattr(cause, "msg", None) or "it cannot be set"
-        return _one_line(f"{key}: {reason}")
+        return _one_line(f"{key}: {getattr(cause, 'msg', None) or 'it cannot be set'}")
     # There is no public way to ask where a node stands.
     path = str(parent._get_full_key(None) or "")  # noqa: SLF001
     known = [str(name) for name in parent if name != "hydra"]

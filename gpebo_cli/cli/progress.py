@@ -37,7 +37,7 @@ class Progress:
         self._terminal = sys.stderr.isatty() and not quiet and not loud
         self._loud = loud
         self._stage = ""
-        self._start = self._since = monotonic()
+        self._since = monotonic()
         self._timer = Timer(_DELAY, self._show)
         self._timer.daemon = True
         self._display: Display | None = None

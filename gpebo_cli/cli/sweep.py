@@ -173,8 +173,7 @@ def _launch(
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     forks = type(launcher).__name__ == "JoblibLauncher"
     if forks:
-        followed = partial(workers.follow, must=True)
-        how = {"initializer": followed, "initargs": (os.getpid(),)}
+        how = {"initializer": partial(workers.follow, must=True), "initargs": (os.getpid(),)}
         cast("Any", launcher).joblib |= how  # arguments of joblib.Parallel
     for first in range(0, len(waiting), size):
         numbers = waiting[first : first + size]

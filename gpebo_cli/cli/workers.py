@@ -12,6 +12,7 @@ import os
 import signal
 import warnings
 from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import suppress
 from multiprocessing import resource_tracker
 from pathlib import Path
@@ -35,16 +36,15 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
         ChildProcessError: a child has been dead and uncollected for longer than ``patience``.
         KeyboardInterrupt: Ctrl-C was pressed; the processes have been ended.
     """
-    returned: list[T] = []
-    raised: list[BaseException] = []
+    outcome: Future[T] = Future()
 
     def run() -> None:
         try:
             _start_trackers()
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # children inherit it
-            returned.append(launch())
+            outcome.set_result(launch())
         except BaseException as error:  # noqa: BLE001  raised again below
-            raised.append(error)
+            outcome.set_exception(error)
 
     thread = Thread(target=run, name=_LAUNCHER, daemon=True)
     thread.start()
@@ -56,9 +56,7 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
             end_children()
             thread.join(_FAREWELL)
         raise
-    if raised:
-        raise raised[0]
-    return returned[0]
+    return outcome.result()
 
 
 def stranded() -> bool:

@@ -32,7 +32,8 @@ _DESCRIPTIVE = ("title", "reference")  # of files in the groups; for people
 _FOLDER = "estimator"  # an observer that estimates by itself: its name again, for its folders
 
 _INCHES = (1.5, 40.0)  # how wide a figure may be
-_OPEN = ("start", "horizon")  # of time: null where the data, or a default, decides
+# Of time: null where a default decides, or where a recording does, and what stands for that.
+_OPEN: Mapping[str, Any] = {"start": -math.inf, "horizon": math.inf}
 
 
 def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
@@ -89,14 +90,8 @@ def _time(config: Mapping[str, Any], *, recorded: bool) -> TimeSettings:
     """The span of the experiment; ``null`` is the default, or where a recording begins or ends."""
     section = {key: value for key, value in _group(config, "time").items()
                if value is not None or key not in _OPEN}
-    time = read(TimeSettings, section, "time")
-    if not recorded:
-        return time
-    return replace(
-        time,
-        start=time.start if "start" in section else -math.inf,
-        horizon=time.horizon if "horizon" in section else math.inf,
-    )
+    left = {key: end for key, end in _OPEN.items() if recorded and key not in section}
+    return replace(read(TimeSettings, section, "time"), **left)
 
 
 def _observer(config: Mapping[str, Any]) -> dict[str, Any]:

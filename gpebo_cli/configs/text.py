@@ -76,7 +76,7 @@ class _Builder:
             elif isinstance(event, yaml.MappingStartEvent):
                 value = self._mapping(event, depth)
             else:
-                value = self._sequence(event, depth)
+                value = [self._value(inner, depth + 1) for inner in self._inside(event, depth)]
             if event.anchor is not None:
                 self._anchors[event.anchor] = value, self._count - before
         if self._count > _MAX_ENTRIES:
@@ -89,9 +89,6 @@ class _Builder:
             self._refuse(event, _DEEP)
         while not isinstance(inner := next(self._events), yaml.CollectionEndEvent):
             yield inner
-
-    def _sequence(self, event: yaml.NodeEvent, depth: int) -> list[Any]:
-        return [self._value(inner, depth + 1) for inner in self._inside(event, depth)]
 
     def _mapping(self, event: yaml.NodeEvent, depth: int) -> dict[str, Any]:
         found: dict[str, Any] = {}

@@ -48,7 +48,7 @@ def from_netlist(
     text, file = fspath(netlist), f"netlist {name}"
     if "\n" not in text:
         text, file = read_text(text, _MAX_TEXT), text
-    return circuit_from_netlist(text, name, file, measure, unknown)[0]
+    return circuit_from_netlist(text, name, file, measure, unknown)
 
 
 def from_file(

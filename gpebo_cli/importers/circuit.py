@@ -9,7 +9,6 @@ from __future__ import annotations
 import keyword
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from itertools import chain, count
 from typing import Any
 
@@ -31,34 +30,11 @@ _TERM = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class Topology:
-    """What the graph of a circuit says of its index (Estévez Schwarz and Tischendorf, 2000)."""
-
-    loops: tuple[tuple[str, ...], ...]  # of capacitors and at least one voltage source each
-    cutsets: tuple[tuple[str, ...], ...]  # of inductors and current sources each
-    decides: bool  # False with controlled sources, couplings or transformers: a bound no more
-
-    @property
-    def index(self) -> int:
-        """2 where there is a loop or a cutset, else at most 1."""
-        return 2 if self.loops or self.cutsets else 1
-
-    def __str__(self) -> str:
-        found = [f"loop of capacitors and voltage sources: {', '.join(x)}" for x in self.loops]
-        found += [f"cutset of inductors and current sources: {', '.join(x)}" for x in self.cutsets]
-        why = "; ".join(found) or (
-            "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
-        )
-        note = "" if self.decides else "; controlled sources and couplings may change it"
-        return f"index {self.index} by topology ({why}{note})"
-
-
 def circuit_from_netlist(
     text: str, name: str, file: str = "netlist", measure: str | Iterable[str] | None = None,
     unknown: str | Iterable[str] | None = None,
-) -> tuple[PlantDraft, Topology]:
-    """The descriptor system of a netlist (see ``from_netlist``), and what its topology says."""
+) -> PlantDraft:
+    """The descriptor system of a netlist, see ``from_netlist``."""
     netlist = read_netlist(text, file)
     topology = examine(netlist, file)
     measured = split_names(measure)
@@ -68,18 +44,20 @@ def circuit_from_netlist(
         builder.output(output)
     sources = {name: e.name for name, e in builder.elements.items()}
     draft.make_unknown(sources.get(word.lower(), word) for word in split_names(unknown))
-    draft.comments.append(str(topology))
-    return draft, topology
+    draft.comments.append(topology)
+    return draft
 
 
-def examine(netlist: Netlist, file: str) -> Topology:
-    """Loops and cutsets that raise the index.
+def examine(netlist: Netlist, file: str) -> str:
+    """What the graph says of the index (Estévez Schwarz and Tischendorf, 2000), in words.
 
-    A floating node, a loop or a cutset of independent sources alone is a ConfigError.
+    It is 2 where there is a loop or a cutset, else at most 1; with controlled sources, couplings or
+    transformers that is a bound no more (ConfigError: a floating node, a loop or a cutset of
+    independent sources alone).
     """
     from scipy.cluster.hierarchy import DisjointSet  # a third of a second to import
 
-    branches = [e for e in netlist.elements if e.kind != "K"]
+    branches = [e for e in netlist.elements.values() if e.kind != "K"]
     nodes = {node for e in branches for node in e.nodes}
     if GROUND not in nodes:
         raise ConfigError(f"{file}: no element is connected to ground, which is the node 0")
@@ -116,10 +94,15 @@ def examine(netlist: Netlist, file: str) -> Topology:
                 f"{e.name} drives a current that can flow back through current sources only; its "
                 "voltage would be anything"
             )
-    return Topology(
-        tuple(_loops(branches)), tuple(_cutsets(branches, joined("LIGF").subsets())),
-        all(e.kind in "RLCVIS" for e in netlist.elements),
+    cutsets = _cutsets(branches, joined("LIGF").subsets())
+    found = [f"loop of capacitors and voltage sources: {', '.join(x)}" for x in _loops(branches)]
+    found += [f"cutset of inductors and current sources: {', '.join(x)}" for x in cutsets]
+    why = "; ".join(found) or (
+        "no loop of capacitors with voltage sources, no cutset of inductors and current sources"
     )
+    if not all(e.kind in "RLCVIS" for e in netlist.elements.values()):
+        why += "; controlled sources and couplings may change it"
+    return f"index {2 if found else 1} by topology ({why})"
 
 
 def _natural(name: str) -> list[tuple[int, int, str]]:
@@ -162,23 +145,19 @@ def _cutsets(
     """Inductors and current sources around each part that nothing else connects to ground."""
     crossing = [e for e in branches if e.kind in "LIGF"]
     for part in sorted(parts, key=min):
-        if GROUND in part:
-            continue
-        sides = [[node in part for node in e.nodes[:2]] for e in crossing]
-        yield tuple(e.name for e, (a, b) in zip(crossing, sides, strict=True) if a != b)
+        if GROUND not in part:
+            yield tuple(e.name for e in crossing if (e.nodes[0] in part) != (e.nodes[1] in part))
 
 
 class _Builder:
     """Stamps of the elements, row by row."""
 
     def __init__(self, netlist: Netlist, name: str, file: str, measured: Sequence[str]) -> None:
-        self.file = file
+        self.file, self.netlist = file, netlist
         # The plant does not depend on the order of the lines, nor do roundings of its solution.
-        elements = sorted(
-            netlist.elements, key=lambda e: (_ORDER.index(e.kind), _natural(e.name))
-        )
-        self.netlist = netlist
-        self.elements = {e.name.lower(): e for e in elements}
+        self.elements = dict(sorted(
+            netlist.elements.items(), key=lambda e: (_ORDER.index(e[1].kind), _natural(e[0]))
+        ))
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self._taken: set[str] = set()

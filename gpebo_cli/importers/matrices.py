@@ -71,10 +71,8 @@ def from_matrices(
     draft.outputs.update(dict.fromkeys(names_of("outputs", outputs, "y", r, name), ""))
     for i in range(n):
         draft.equation(f"equation {i + 1}")
-    draft.add_matrix("E", given.get("E", np.eye(n)))
-    for key in "ABCD":
-        if key in given:
-            draft.add_matrix(key, given[key])
+    for key, matrix in {"E": np.eye(n), **given}.items():
+        draft.add_matrix(key, matrix)
     return draft
 
 

@@ -67,17 +67,6 @@ class Element:
     initial: float | None = None
 
 
-@dataclass(frozen=True)
-class Netlist:
-    """A circuit without its subcircuits: they are in place."""
-
-    title: str
-    elements: tuple[Element, ...]
-    parameters: Mapping[str, float | str]
-    initial: Mapping[str, float]  # by quantity, ``v(out)`` or ``i(l1)``
-    saved: tuple[str, ...]  # quantities that are saved
-
-
 @dataclass
 class _Block:
     """Lines between .subckt and .ends, or those outside."""
@@ -115,14 +104,11 @@ def read_netlist(text: str, file: str = "netlist") -> Netlist:
     """Read a netlist, whose first line is the title; a ConfigError names line and element."""
     title, lines = _logical_lines(text, file)
     outside, blocks = _blocks(lines)
-    reader = _Reader(blocks)
-    reader.expand(outside, _Scope({}, {}))
-    if not reader.elements:
+    netlist = Netlist(title, blocks)
+    netlist.expand(outside, _Scope({}, {}))
+    if not netlist.elements:
         raise ConfigError(f"{file}: there is no element in it (the first line is a title)")
-    return Netlist(
-        title, tuple(reader.elements.values()), reader.parameters, reader.initial,
-        tuple(reader.saved),
-    )
+    return netlist
 
 
 def number(text: str) -> float | None:
@@ -225,15 +211,16 @@ def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
     return plain, options
 
 
-class _Reader:
-    """Collects elements while subcircuits are put in place."""
+@dataclass
+class Netlist:
+    """A circuit, in which subcircuits are put in place while it is read."""
 
-    def __init__(self, blocks: Mapping[str, _Block]) -> None:
-        self.blocks = blocks
-        self.elements: dict[str, Element] = {}  # by lower-case name
-        self.parameters: dict[str, float | str] = {}
-        self.initial: dict[str, float] = {}
-        self.saved: list[str] = []
+    title: str
+    blocks: Mapping[str, _Block]  # the subcircuits
+    elements: dict[str, Element] = field(default_factory=dict)  # by lower-case name
+    parameters: dict[str, float | str] = field(default_factory=dict)
+    initial: dict[str, float] = field(default_factory=dict)  # by ``v(out)`` or ``i(l1)``
+    saved: list[str] = field(default_factory=list)  # quantities
 
     def expand(self, block: _Block, scope: _Scope) -> None:
         """Read the lines of a block, in which its own parameters are known, too."""

@@ -15,6 +15,8 @@ from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.model.expressions import shorten
 from gpebo_cli.schema import counted, listed, nearest
 
+Grid = list[list[tuple[int, object]]]  # entries by row, each with its column
+
 
 @dataclass(frozen=True)
 class Side:
@@ -44,10 +46,8 @@ def brief(value: object) -> str:
     return shorten(value if isinstance(value, str) else reprlib.repr(value))
 
 
-def matrix(
-    plant: str, key: str, value: object, down: Side, across: Side, *, needed: bool
-) -> list[list[tuple[int, object]]]:
-    """The entries of a matrix by row, each with its column; of a sparse one those that it has.
+def matrix(where: str, value: object, down: Side, across: Side, *, needed: bool) -> Grid:
+    """The entries of a matrix, whose place and name are ``where``; of a sparse one those it has.
 
     ``value`` is a list of rows, a mapping of places, an array (rows, columns) or one of SciPy's
     sparse ones. If it is not ``needed``, there may be no entries (ConfigError: anything else, or a
@@ -58,50 +58,47 @@ def matrix(
         if needed and n_rows and n_columns:
             why = across if down.noun == "state" else down
             raise ConfigError(
-                f"{plant}: {key} is missing; {why}, so it needs {counted(n_rows, 'row')} "
+                f"{where} is missing; {why}, so it needs {counted(n_rows, 'row')} "
                 f"of {n_columns}"
             )
         return []
     if isinstance(value, np.ndarray) or is_sparse(value):
-        return _numbers(plant, key, value, down, across)
+        return _numbers(where, value, down, across)
     if isinstance(value, Mapping) and value:
-        return _by_place(plant, key, value, down, across)
-    rows = per_row(plant, key, value, down, f"be a list of {counted(n_rows, 'row')}", "row")
-    grid: list[list[tuple[int, object]]] = []
+        return _by_place(where, value, down, across)
+    rows = per_row(where, value, down, f"be a list of {counted(n_rows, 'row')}", "row")
+    grid: Grid = []
     for i, row in enumerate(rows):
         entries = items_of(row)
         if entries is None:
             raise ConfigError(
-                f"{plant}: {key}[{i}] must be a list, one entry per {across.noun}, not {brief(row)}"
+                f"{where}[{i}] must be a list, one entry per {across.noun}, not {brief(row)}"
             )
         grid.append(list(enumerate(entries)))
     widths = [len(row) for row in grid]
     for i, width in enumerate(widths):
         if width != widths[0]:
+            plant, _, key = where.rpartition(": ")
             raise ConfigError(
                 f"{plant}: the rows of {key} differ: {key}[0] has length {widths[0]}, "
                 f"{key}[{i}] has length {width}"
             )
     if widths[0] != n_columns:
-        raise ConfigError(f"{plant}: {key} has {counted(widths[0], 'column')} but {across}")
+        raise ConfigError(f"{where} has {counted(widths[0], 'column')} but {across}")
     return grid
 
 
-def per_row(
-    plant: str, key: str, value: object, rows: Side, must: str, noun: str
-) -> list[object]:
+def per_row(where: str, value: object, rows: Side, must: str, noun: str) -> list[object]:
     """The items of a list, as many as there are rows (ConfigError: it is none, or has others)."""
     items = items_of(value)
     if items is None:
-        raise ConfigError(f"{plant}: {key} must {must}, not {brief(value)}")
+        raise ConfigError(f"{where} must {must}, not {brief(value)}")
     if len(items) != len(rows.names):
-        raise ConfigError(f"{plant}: {key} has {counted(len(items), noun)} but {rows}")
+        raise ConfigError(f"{where} has {counted(len(items), noun)} but {rows}")
     return items
 
 
-def _by_place(
-    plant: str, key: str, value: Mapping[Any, object], down: Side, across: Side
-) -> list[list[tuple[int, object]]]:
+def _by_place(where: str, value: Mapping[Any, object], down: Side, across: Side) -> Grid:
     """The entries of a mapping, by row and column: ``e1,il: -1`` or ``e1: {il: -1}``."""
     grid: list[dict[int, object]] = [{} for _ in down.names]
     places = [{name: i for i, name in enumerate(side.names)} for side in (down, across)]
@@ -111,19 +108,19 @@ def _by_place(
             given = {column: given}  # noqa: PLW2901  the same, written otherwise
         if not isinstance(given, Mapping):
             raise ConfigError(
-                f"{plant}: {key} has {brief(label)}: {brief(given)}; write entries as "
+                f"{where} has {brief(label)}: {brief(given)}; write entries as "
                 f"'row,column': value (in braces with quotation marks) or row: {{column: value}}"
             )
-        i = _place(plant, f"{key}: row", row, down, places[0])
+        i = _place(f"{where}: row", row, down, places[0])
         for name, entry in given.items():
-            j = _place(plant, f"{key}: column", str(name), across, places[1])
+            j = _place(f"{where}: column", str(name), across, places[1])
             if j in grid[i]:
-                raise ConfigError(f"{plant}: {key} has the entry {row.strip()},{name} twice")
+                raise ConfigError(f"{where} has the entry {row.strip()},{name} twice")
             grid[i][j] = entry
     return [sorted(row.items()) for row in grid]
 
 
-def _place(plant: str, where: str, label: str, side: Side, places: Mapping[str, int]) -> int:
+def _place(where: str, label: str, side: Side, places: Mapping[str, int]) -> int:
     """Number of a row or column by its name, or by its number from 0 on."""
     label = label.strip()
     if label in places:
@@ -131,20 +128,18 @@ def _place(plant: str, where: str, label: str, side: Side, places: Mapping[str, 
     if label.isdecimal() and int(label) < len(side.names):
         return int(label)
     raise ConfigError(
-        f"{plant}: {where} {brief(label)} is no {side.noun}{nearest(label, side.names)}, and no "
+        f"{where} {brief(label)} is no {side.noun}{nearest(label, side.names)}, and no "
         f"number from 0 to {len(side.names) - 1}; {side}"
     )
 
 
-def _numbers(
-    plant: str, key: str, value: Any, down: Side, across: Side
-) -> list[list[tuple[int, object]]]:
+def _numbers(where: str, value: Any, down: Side, across: Side) -> Grid:
     """The same of an array, or of one of SciPy's sparse matrices."""
     shape = (len(down.names), len(across.names))
     if value.shape != shape:
         size = " × ".join(map(str, value.shape))
         raise ConfigError(
-            f"{plant}: {key} is {size}, and {down} and {across}: expected {shape[0]} × {shape[1]}"
+            f"{where} is {size}, and {down} and {across}: expected {shape[0]} × {shape[1]}"
         )
     if isinstance(value, np.ndarray):
         return [list(enumerate(row)) for row in value.tolist()]

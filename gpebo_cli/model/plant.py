@@ -114,7 +114,7 @@ def plant_from_mapping(
 
     where = "inputs" if kind == "plant" else "signals"
     u = [read(value, f"{where}.{label}", None) for label, value in inputs.items()]
-    entries = _entries(plant, mapping, read, states, tuple(inputs), tuple(unknowns), outputs)
+    entries = _entries(plant, mapping, read, kinds)
     entries["u"] = (len(inputs),), dict(enumerate(u))
     for label, value in unknowns.items():
         if value is None:
@@ -145,13 +145,12 @@ def plant_from_mapping(
 
 
 def _entries(
-    plant: str, mapping: Mapping[str, object], read: _Read, states: tuple[str, ...],
-    inputs: tuple[str, ...], unknowns: tuple[str, ...], outputs: tuple[str, ...],
+    plant: str, mapping: Mapping[str, object], read: _Read, kinds: Mapping[str, tuple[str, ...]]
 ) -> dict[str, MatrixEntries]:
-    """What stands in φ and in each matrix."""
-    rows = Side("state", states)
-    driven, sought = Side("input", inputs), Side("unknown", unknowns)
-    measured = Side("output", outputs)
+    """What stands in φ and in each matrix; the names are those of states, inputs and so on."""
+    rows, driven, sought, measured = (
+        Side(kind.split()[1], names) for kind, names in kinds.items()
+    )
     sides = {
         "E": (rows, rows, _OF_TIME),
         "A": (rows, rows, _OF_ALL),
@@ -161,25 +160,21 @@ def _entries(
         "H": (measured, sought, _OF_INPUTS),
         "B": (rows, driven, _OF_ALL),
     }
-    phi, of = mapping.get("phi"), f"{counted(len(states), 'entry')}, one for each row of E"
-    known = [] if is_empty(phi) else per_row(plant, "phi", phi, rows, f"be a list of {of}", "entry")
+    phi, count = mapping.get("phi"), len(rows.names)
+    must = f"be a list of {counted(count, 'entry')}, one for each row of E"
+    known = [] if is_empty(phi) else per_row(f"{plant}: phi", phi, rows, must, "entry")
     entries: dict[str, MatrixEntries] = {
-        "phi": (
-            (len(states),),
-            {i: read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)},
-        )
+        "phi": ((count,), {i: read(value, f"phi[{i}]", _OF_ALL) for i, value in enumerate(known)})
     }
     for key, (down, across, allowed) in sides.items():
         # Unknowns may be in the outputs only; inputs too, or in other matrices.
-        optional = {"D", "H"}
-        if not is_empty(mapping.get("H")):
-            optional.add("F")
-        if not is_empty(mapping.get("D")) or any(
-            not e.node.signals.isdisjoint(inputs)
-            for _, given in entries.values() for e in given.values()
-        ):
-            optional.add("B")
-        grid = matrix(plant, key, mapping.get(key), down, across, needed=key not in optional)
+        optional = key in "DH" or (key == "F" and not is_empty(mapping.get("H"))) or (
+            key == "B" and (not is_empty(mapping.get("D")) or any(
+                not e.node.signals.isdisjoint(driven.names)
+                for _, given in entries.values() for e in given.values()
+            ))
+        )
+        grid = matrix(f"{plant}: {key}", mapping.get(key), down, across, needed=not optional)
         width = len(across.names)
         entries[key] = (
             (len(down.names), width),
@@ -311,7 +306,7 @@ def _initial_values(plant: str, value: object, states: tuple[str, ...]) -> dict[
             raise ConfigError(f"{plant}: initial_state lacks {listed(missing)}")
         return {state: value[state] for state in states}
     must = f"map states to numbers or list {counted(len(states), 'number')}"
-    values = per_row(plant, "initial_state", value, Side("state", states), must, "value")
+    values = per_row(f"{plant}: initial_state", value, Side("state", states), must, "value")
     return dict(zip(states, values, strict=True))
 
 

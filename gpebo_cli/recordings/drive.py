@@ -56,9 +56,7 @@ def tables(
 
 def driven(system: DescriptorSystem, found: Mapping[str, Piecewise]) -> DescriptorSystem:
     """The system with tables in place of the inputs of their names."""
-    if not found:
-        return system
-    text = cast(TextCoefficients, system.coefficients)  # a plant with a file is text
+    text = cast(TextCoefficients, system.coefficients)  # a plant of a file is text
     numbers = {system.inputs.index(name): table for name, table in found.items()}
     return replace(system, coefficients=text.with_tables(numbers))
 

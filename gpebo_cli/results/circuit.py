@@ -7,9 +7,8 @@ compares the two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module, util
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gpebo_cli.results.files import csv_text
 from gpebo_cli.results.style import TEXT, WIDTH, new_figure, our_rc
@@ -23,8 +22,7 @@ GROUND = "0"
 _Point = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Branch:
+class Branch(NamedTuple):
     """An element; its ``current`` (a state, or empty if it is none) flows from start to end."""
 
     element: str
@@ -55,8 +53,7 @@ def available() -> bool:
 
 def netlist() -> str:
     """What is drawn, as CSV: element, nodes it connects, and the current between them."""
-    head = ("element", "from", "to", "current")
-    return csv_text([head, *((b.element, b.start, b.end, b.current) for b in BRANCHES)])
+    return csv_text([("element", "from", "to", "current"), *BRANCHES])
 
 
 def circuit() -> Figure:
@@ -107,9 +104,8 @@ def _ends(branch: Branch) -> tuple[_Point, _Point]:
 
 def _add_wires(drawing: Any, elements: Any) -> None:
     """The rails, dots where more than two wires meet, and ground."""
-    drawing.add(elements.Line().at((_AT["V"], _TOP)).to((_AT["C1"], _TOP)))
-    drawing.add(elements.Line().at((_AT["C2"], _TOP)).to((_AT["L"], _TOP)))
-    drawing.add(elements.Line().at((_AT["V"], 0.0)).to((_AT["L"], 0.0)))
+    for first, last, height in (("V", "C1", _TOP), ("C2", "L", _TOP), ("V", "L", 0.0)):
+        drawing.add(elements.Line().at((_AT[first], height)).to((_AT[last], height)))
     for element, node in (("R2", ""), ("C1", "$e_1$"), ("C2", "$e_2$")):
         drawing.add(elements.Dot(radius=0.09).at((_AT[element], _TOP)).label(node, loc="top"))
         drawing.add(elements.Dot(radius=0.09).at((_AT[element], 0.0)))

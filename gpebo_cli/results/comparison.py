@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -30,7 +30,7 @@ _MOST_MAPS = 8
 
 def row(case: Case) -> dict[str, Value]:
     """One row of the table: run, case, what was chosen, gains, metrics (NaN: never)."""
-    return {"run": case.run, "case": float(case.number), **_chosen(case), **case.metrics}
+    return {"run": case.run, "case": float(case.number), **case.chosen, **case.metrics}
 
 
 def names(cases: Sequence[Case]) -> list[str]:
@@ -47,7 +47,7 @@ def varying(cases: Sequence[Case]) -> list[str]:
     """
     values: dict[str, set[Value]] = {}
     for case in cases:
-        for name, value in _chosen(case).items():
+        for name, value in case.chosen.items():
             values.setdefault(name, set()).add(value)
     return [name for name, found in values.items() if len(found) > 1]
 
@@ -93,7 +93,7 @@ def _comparable(cases: Sequence[Case]) -> dict[str, list[Case]]:
     spans = {case.folder: span(case.folder) for case in cases}
     groups: dict[tuple[Value, tuple[float, float]], list[Case]] = {}
     for case in cases:
-        groups.setdefault((case.settings["plant"], spans[case.folder]), []).append(case)
+        groups.setdefault((case.chosen["plant"], spans[case.folder]), []).append(case)
     if len(groups) == 1:
         return {"": list(cases)}
     plants = [plant for plant, _ in groups]
@@ -219,12 +219,8 @@ def _label(metric: str) -> str:
     return with_unit(WORDS[metric], "s" if metric.startswith("seconds") else "")
 
 
-def _chosen(case: Case) -> dict[str, Value]:
-    return {**case.settings, **case.gains}
-
-
 def _choice(case: Case, name: str) -> float:
-    return _as_number(_chosen(case).get(name, np.nan))
+    return _as_number(case.chosen.get(name, np.nan))
 
 
 def _as_number(value: Value) -> float:
@@ -236,7 +232,7 @@ def _as_number(value: Value) -> float:
 
 def _is_axis(cases: Sequence[Case], name: str) -> bool:
     """Whether a choice is a positive number wherever there is one: a gain, a tolerance, a time."""
-    values = [_chosen(case)[name] for case in cases if name in _chosen(case)]
+    values = [case.chosen[name] for case in cases if name in case.chosen]
     return all(0 < _as_number(value) < math.inf for value in values)
 
 
@@ -245,13 +241,13 @@ def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[C
 
     Where that leaves a choice twice, runs differ in what they do not tell: each folder is a group.
     """
-    relevant = [case for case in cases if all(name in _chosen(case) for name in without)]
+    relevant = [case for case in cases if all(name in case.chosen for name in without)]
     others = [name for name in varying(relevant) if name not in without]
-    twice = len({str(sorted(_chosen(case).items())) for case in relevant}) < len(relevant)
+    twice = len({str(sorted(case.chosen.items())) for case in relevant}) < len(relevant)
     groups: dict[str, list[Case]] = {}
     for case in relevant:
         folder = [case.run.partition("/")[0]] if twice else []
-        label = ", ".join(filter(None, [*folder, _words(case, others)]))
+        label = ", ".join(filter(None, [*folder, words(case.chosen, others)]))
         groups.setdefault(label, []).append(case)
     return groups
 
@@ -259,22 +255,18 @@ def _groups(cases: Sequence[Case], without: tuple[str, ...]) -> dict[str, list[C
 def _labels(cases: Sequence[Case], chosen: Sequence[Case]) -> list[str]:
     """The shortest name of each of those chosen that tells it from all others."""
     others, runs = varying(cases), {case.run for case in cases}
-    if len({_words(case, others) for case in cases}) == len(cases):
-        return [_words(case, others) for case in chosen]
+    if len({words(case.chosen, others) for case in cases}) == len(cases):
+        return [words(case.chosen, others) for case in chosen]
     if len(runs) == len(cases):
         others = []
-    parts = [[case.run if len(runs) > 1 else "", _words(case, others)] for case in chosen]
+    parts = [[case.run if len(runs) > 1 else "", words(case.chosen, others)] for case in chosen]
     return [", ".join(filter(None, each)) for each in parts]
 
 
-def _words(case: Case, chosen: Sequence[str]) -> str:
-    """``drem, γ = 10⁸``: names are left out where the value says it all."""
+def words(chosen: Mapping[str, Value], names: Iterable[str]) -> str:
+    """``drem, γ = 10⁸``, of what has these names: they are left out where the value says it all."""
     parts = []
-    values = _chosen(case)
-    for name in chosen:
-        value = values.get(name)
-        if value is None:
-            continue
+    for name, value in ((name, chosen[name]) for name in names if name in chosen):
         number = _as_number(value)
         if math.isfinite(number):
             parts.append(f"{symbol(name)} = {number_text(number)}")

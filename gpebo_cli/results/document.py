@@ -31,8 +31,7 @@ _SECTIONS = ("recording", "noise", "fit", "excitation", "error_estimate", "timin
 def document(parts: Sequence[Found], made_by: Provenance) -> str:
     """The page, complete in itself."""
     title = f"gpebo: {', '.join(part.label for part in parts)}"
-    sections = "".join(map(_part, parts))
-    return html.document(title, sections + html.footer(made_by), embedded=True)
+    return html.document(title, "".join(map(_part, parts)) + html.footer(made_by), embedded=True)
 
 
 def _part(part: Found) -> str:
@@ -148,10 +147,9 @@ def _estimates(summary: Mapping[str, Any]) -> list[list[str]]:
     head = ["", *(f"case {number}" for number, _ in cases), *(["truth"] if known else [])]
     rows = []
     for name, first in cases[0][1].items():
-        own = [case[name] for _, case in cases]
         cells = [
             _text(one["value"]) + ("" if one["std"] is None else f" ± {_text(one['std'])}")
-            for one in own
+            for one in (case[name] for _, case in cases)
         ]
         truth = "" if first["true"] is None else _text(first["true"])
         rows.append([with_unit(name, first["unit"] or ""), *cells, *([truth] if known else [])])

@@ -19,11 +19,11 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
-from gpebo_cli.results.comparison import norm_panels
+from gpebo_cli.results.comparison import norm_panels, words
 from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
-from gpebo_cli.results.symbols import error_of, number_text, subscript, symbol, typeset, unit_of
+from gpebo_cli.results.symbols import error_of, number_text, symbol, typeset, unit_of
 from gpebo_cli.schema import shown, unknown
 
 if TYPE_CHECKING:
@@ -174,8 +174,8 @@ def gram(result: RunResult) -> list[Panel]:
         return []
     t, eigenvalues = excitation.t, excitation.gram_eigenvalues
     curves = [
-        Curve(t, eigenvalues[:, i], f"λ{subscript(i + 1)}", line(i), rf"$\lambda_{{{i + 1}}}$")
-        for i in range(eigenvalues.shape[1])
+        Curve(t, values, symbol(f"lambda_{i + 1}"), line(i), rf"$\lambda_{{{i + 1}}}$")
+        for i, values in enumerate(eigenvalues.T)
     ]
     if (rho := excitation.rho) is not None:
         level = number_text(rho)
@@ -246,9 +246,7 @@ def error_norms(result: RunResult, estimation: EstimationResult) -> list[Panel]:
     """Norms of the errors of all parameters and of all states for a few of at least three cases."""
     if len(estimation.cases) < MIN_GAINS:
         return []
-    chosen = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, chosen)
-    return _norm_panels([(text, result, case) for text, case in zip(labels, chosen, strict=True)])
+    return _norm_panels([(label, result, case) for label, case in _shown(result, estimation)])
 
 
 def overlay(results: Mapping[str, RunResult]) -> list[Panel]:
@@ -366,11 +364,6 @@ def _known(result: RunResult) -> list[int]:
     return [int(i) for i in np.flatnonzero(~unknown)]
 
 
-def _shown_cases(estimation: EstimationResult) -> list[int]:
-    count = len(estimation.cases)
-    return [int(case) for case in np.linspace(0, count - 1, min(count, MAX_CASES)).round()]
-
-
 def _seen(estimation: EstimationResult, members: Iterable[int]) -> list[int]:
     """Those of the states ``members`` that the observer sees: not all of their estimates NaN."""
     return [i for i in members if not np.isnan(estimation.states[:, :, i]).all()]
@@ -404,31 +397,29 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
     return norm_panels(curves, labels, log=log)
 
 
-def _case_labels(
-    result: RunResult, estimation: EstimationResult, shown: Sequence[int]
-) -> list[str]:
-    """Name cases by the gains that vary among those shown; a single one by its estimator."""
-    cases = [estimation.cases[case] for case in shown]
+def _shown(result: RunResult, estimation: EstimationResult) -> list[tuple[str, int]]:
+    """Names and numbers of the cases that are shown.
+
+    They are named by the gains that vary among them; a single one by its estimator.
+    """
+    count = len(estimation.cases)
+    chosen = [int(case) for case in np.linspace(0, count - 1, min(count, MAX_CASES)).round()]
+    cases = [estimation.cases[case] for case in chosen]
     gains = list(dict.fromkeys(gain for case in cases for gain in case))
     varying = [gain for gain in gains if len({case.get(gain) for case in cases}) > 1]
     if not varying:
         name = str(result.settings.estimator.get("name", "estimate"))
-        return [name] if len(shown) == 1 else [f"{name}, case {case}" for case in shown]
-    return [
-        ", ".join(f"{symbol(gain)} = {number_text(case[gain])}" for gain in varying if gain in case)
-        for case in cases
-    ]
+        return [(name if count == 1 else f"{name}, case {case}", case) for case in chosen]
+    return [(words(case, varying), k) for case, k in zip(cases, chosen, strict=True)]
 
 
 def _per_case(
     result: RunResult, estimation: EstimationResult, values: Array
 ) -> tuple[Curve, ...]:
     """A curve for each case that is shown, of values (G, M) at the times of the estimates."""
-    chosen = _shown_cases(estimation)
-    labels = _case_labels(result, estimation, chosen)
     return tuple(
         Curve(estimation.t, values[case], label, line(k))
-        for k, (case, label) in enumerate(zip(chosen, labels, strict=True))
+        for k, (label, case) in enumerate(_shown(result, estimation))
     )
 
 
@@ -450,7 +441,7 @@ def _estimate(
 ) -> Panel:
     """Estimates (G, M) of ``name`` with their ± 2σ, and the truth if it is known."""
     curves = _per_case(result, estimation, values)
-    deviation, drawn = _deviation(result, estimation, name), values[_shown_cases(estimation)]
+    deviation, drawn = _deviation(result, estimation, name), np.stack([c.y for c in curves])
     bands = [] if deviation is None else [values[0] + side * deviation for side in (-2, 2)]
     if bands:
         low, high = bands

@@ -33,8 +33,7 @@ class Case:
     run: str  # the folder, as a person named it
     folder: Path
     number: int  # of the case in that folder
-    settings: Mapping[str, str]  # plant, estimator, overrides
-    gains: Mapping[str, float]
+    chosen: Mapping[str, str | float]  # plant, estimator, overrides, gains
     metrics: Mapping[str, float]  # METRICS first, NaN: never; NAME_hat and NAME_std at the end
 
 
@@ -136,8 +135,8 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     told = {k: v for k, v in overrides.items() if k.removeprefix("estimator.") not in gains}
     return [
         Case(
-            run, folder, int(number), chosen | told,
-            {name: float(columns[name][i]) for name in gains},
+            run, folder, int(number),
+            {**chosen, **told, **{name: float(columns[name][i]) for name in gains}},
             {name: float(columns[name][i]) for name in metrics}
             | _estimates(summary, int(number)),
         )

@@ -25,14 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True)
-class Caption:
-    """A figure's number in the paper, if it is there, and what it shows."""
-
-    text: str
-    number: int | None = None
-
-
 STUDIES = (
     "paper_circuit", "paper_descriptor", "paper_canonical", "gain_sweep", "estimators_compared",
     "literal_regressor",
@@ -41,33 +33,34 @@ STUDIES = (
 PAPERS = "paper_circuit"
 """The one whose figures carry the paper's numbers."""
 
-CAPTIONS: Mapping[str, Caption] = {
-    "circuit": Caption(
-        "the circuit. Arrows and signs are those that give the printed E(t) and A(t). With them "
-        "e2 − e1 = −R₁ ir1, and R₁ is printed negative: a resistor of −R₁ > 0. But e1 = R₂ ir2, "
-        "and R₂ is printed negative as well: taken literally, that branch delivers power. All "
-        "elements vary with time.",
-        1,
-    ),
-    "signals": Caption("inputs and outputs"),
-    "regressor": Caption("the regressor ψ", 2),
-    "states": Caption("the states", 3),
-    "estimates": Caption("the states and their estimates"),
-    "estimates_a": Caption("the differential states x_a and their estimates", 4),
-    "estimates_b": Caption("the other states x_b and their estimates", 5),
-    "parameter_error": Caption("size of the error of each parameter, for each gain", 6),
-    "state_error": Caption("size of the error of each state, for each gain"),
-    "state_error_a": Caption("size of the errors of x_a, for each gain", 7),
-    "state_error_b": Caption("size of the errors of x_b, for each gain", 8),
-    "gram": Caption(
-        "eigenvalues of the Gram matrix of the regressor: it is interval-exciting from the time "
-        "at which the smallest one passes ρ"
-    ),
-    "delta": Caption("Δ, the determinant that mixing leaves as a scalar regressor"),
-    "gains": Caption("final errors, and the time after which errors stay below 1 %, by gain"),
-    "error_norms": Caption("norms of the errors of all parameters and all states, for a few gains"),
-    "estimators": Caption("norms of the errors of all parameters and all states, by estimator"),
+CAPTIONS = {
+    "circuit": "the circuit. Arrows and signs are those that give the printed E(t) and A(t). With "
+    "them e2 − e1 = −R₁ ir1, and R₁ is printed negative: a resistor of −R₁ > 0. But e1 = R₂ ir2, "
+    "and R₂ is printed negative as well: taken literally, that branch delivers power. All "
+    "elements vary with time.",
+    "signals": "inputs and outputs",
+    "regressor": "the regressor ψ",
+    "states": "the states",
+    "estimates": "the states and their estimates",
+    "estimates_a": "the differential states x_a and their estimates",
+    "estimates_b": "the other states x_b and their estimates",
+    "parameter_error": "size of the error of each parameter, for each gain",
+    "state_error": "size of the error of each state, for each gain",
+    "state_error_a": "size of the errors of x_a, for each gain",
+    "state_error_b": "size of the errors of x_b, for each gain",
+    "gram": "eigenvalues of the Gram matrix of the regressor: it is interval-exciting from the "
+    "time at which the smallest one passes ρ",
+    "delta": "Δ, the determinant that mixing leaves as a scalar regressor",
+    "gains": "final errors, and the time after which errors stay below 1 %, by gain",
+    "error_norms": "norms of the errors of all parameters and all states, for a few gains",
+    "estimators": "norms of the errors of all parameters and all states, by estimator",
 }
+"""What each figure shows."""
+_NUMBERS = {name: number for number, name in enumerate((
+    "circuit", "regressor", "states", "estimates_a", "estimates_b", "parameter_error",
+    "state_error_a", "state_error_b",
+), 1)}
+"""Figures of the paper, by what they show."""
 
 # What a committed reference is compared with: the paper's figures and those over gains and
 # estimators. Of Δ and the Gram matrix the early part, 1e-20, is rounding.
@@ -183,7 +176,7 @@ def _save(
     base = escape(f"{folder.name}/{stem(name)}")
     links = ", ".join(f'<a href="{base}.{s}">{s.upper()}</a>' for s in ("csv", *formats))
     width, height = figure.canvas.get_width_height()
-    text = escape(CAPTIONS[name].text.rstrip("."))
+    text = escape(CAPTIONS[name].rstrip("."))
     return f"""<figure>
 <img src="{base}.png" width="{width}" height="{height}" alt="{escape(alt)}">
 <figcaption><b>{heading(name, folder.name)}:</b> {text}. {links}</figcaption>
@@ -196,7 +189,7 @@ def _alt(name: str, panels: Sequence[Panel]) -> str:
     curves = dict.fromkeys(curve.label for panel in panels for curve in panel.curves)
     axes = ", ".join(panel.label + (" (logarithmic)" if panel.log else "") for panel in panels)
     legend = ", ".join(label for label in curves if label)
-    text = f"Line chart of {CAPTIONS[name].text} over {panels[0].axis.label}: {axes}."
+    text = f"Line chart of {CAPTIONS[name]} over {panels[0].axis.label}: {axes}."
     return f"{text} Curves: {legend}." if legend else text
 
 
@@ -208,13 +201,11 @@ def _branch_text(branch: circuit.Branch) -> str:
 
 def stem(figure: str) -> str:
     """Name of a figure's files: with the paper's number where it has one."""
-    number = CAPTIONS[figure].number
-    return f"fig_{figure}" if number is None else f"fig{number}_{figure}"
+    return f"fig{_NUMBERS.get(figure, '')}_{figure}"
 
 
 def heading(figure: str, recipe: str) -> str:
     """What a caption begins with."""
-    number = CAPTIONS[figure].number
-    if number is None:
+    if (number := _NUMBERS.get(figure)) is None:
         return "Not in the paper"
     return f"Fig. {number} of the paper" if recipe == PAPERS else f"As Fig. {number}"

@@ -123,7 +123,7 @@ def estimate_table(result: RunResult) -> list[str]:
     standing = (result.metrics and result.metrics.seconds_to_settled) or {}
     near = "±2σ" if standing else "1 %"
     rows = [["", "estimate", "± std", "unit", f"within {near} of the end since", "estimable"]]
-    for name, told in estimates_at_end(result, case).items():
+    for name, told in estimates_at_end(result, estimation, case).items():
         value, std, from_when = told["value"], told["std"], result.estimable.get(name)
         lasts = name in result.estimable  # the filter's w_<state> move as states do
         estimable = "" if not lasts else "no" if from_when is None else f"from {from_when:.4g} s"

@@ -56,8 +56,7 @@ def blocks(panels: Sequence[Panel]) -> list[list[Column]]:
             name = f"{panel.label}: {curve.label}" if curve.label else panel.label
             columns = [Column(name, drawn(panel, curve), panel.log, panel.size)]
             if curve.down_to is not None:
-                lower = Column(f"{name}, lower edge", curve.down_to, panel.log, panel.size)
-                columns.append(lower)
+                columns.append(Column(f"{name}, lower edge", curve.down_to, panel.log, panel.size))
             for block in found:
                 if np.array_equal(block[0].values, curve.x):
                     block.extend(columns)

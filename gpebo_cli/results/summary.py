@@ -51,28 +51,28 @@ def summary(result: RunResult, made_by: Provenance) -> dict[str, Any]:
             asdict(result.settings.noise) if result.signals.measured_outputs is not None else None
         ),
         **_simulation(system, simulation),
-        "recording": _recording(result.recording),
+        "recording": result.recording and _recording(result.recording),
         "parameters": None if estimation is None else dict(
             zip(estimation.names, estimation.true_parameters[-1], strict=True)
         ),
-        "estimates": _estimates(result),
-        "active_bounds": _active_bounds(estimation),
+        "estimates": estimation and _estimates(result, estimation),
+        "active_bounds": estimation and _active_bounds(estimation),
         "estimable": {name: since is not None for name, since in result.estimable.items()},
         "assumptions": [vars(assumption) for assumption in result.assumptions],
         "warnings": result.warnings,
-        "excitation": _excitation(result.excitation),
+        "excitation": result.excitation and _excitation(result.excitation),
         "estimator_requirement": None if estimation is None else {
             key: getattr(estimation.requirement, key)
             for key in ("name", "holds", "evidence", "text")
         },
-        "cases": _cases(estimation, result.metrics),
+        "cases": estimation and result.metrics and _cases(estimation, result.metrics),
         "error_estimate": {
             "states": simulation.error_estimate if simulation else None,
             "by_state": by_state,
             "regression": regression.error_estimate if regression else None,
             "estimates": estimation.doubts[0] if estimation else None,
         },
-        "fit": _fit(result.fit),
+        "fit": result.fit and _fit(result.fit),
         "elements": simulation.elements if simulation else None,
         "timings": dict(result.timings),
         **asdict(made_by),
@@ -108,17 +108,13 @@ def _simulation(system: DescriptorSystem, simulation: SimulationResult | None) -
     }
 
 
-def _recording(recording: RecordingResult | None) -> dict[str, Any] | None:
-    if recording is None:
-        return None
+def _recording(recording: RecordingResult) -> dict[str, Any]:
     names = ("file", "sha256", "rows", "hold", "first", "last", "known_states", "elements")
     own = {name: getattr(recording, name) for name in names}
     return {**own, "bounded_between_nodes": recording.bounded}
 
 
-def _fit(fit: Fit | None) -> dict[str, Any] | None:
-    if fit is None:
-        return None
+def _fit(fit: Fit) -> dict[str, Any]:
     finite = fit.residual[np.isfinite(fit.residual)]
     return {
         "rms_Y": fit.size,
@@ -129,32 +125,26 @@ def _fit(fit: Fit | None) -> dict[str, Any] | None:
     }
 
 
-def _estimates(result: RunResult) -> object:
+def _estimates(result: RunResult, estimation: EstimationResult) -> object:
     """Every estimate at the end with its truth: of the one case, or of several by number."""
-    estimation = result.estimation
-    if estimation is None:
-        return None
     count = min(len(estimation.cases), MAX_LISTED_CASES)
-    cases = [estimates_at_end(result, k) for k in range(count)]
+    cases = [estimates_at_end(result, estimation, k) for k in range(count)]
     return cases[0] if len(cases) == 1 else {str(k): case for k, case in enumerate(cases)}
 
 
-def _active_bounds(estimation: EstimationResult | None) -> list[dict[str, Any]] | None:
+def _active_bounds(estimation: EstimationResult) -> list[dict[str, Any]] | None:
     """Which bounds hold the estimates at the end; None where there are no bounds."""
-    if estimation is None or not estimation.active:
-        return None
-    return [
+    return None if not estimation.active else [
         {"case": case, **asdict(bound)}
         for case, active in estimation.active.items() if case < MAX_LISTED_CASES
         for bound in active
     ]
 
 
-def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
+def estimates_at_end(
+    result: RunResult, estimation: EstimationResult, case: int
+) -> dict[str, dict[str, Any]]:
     """By name: value, standard deviation, unit and truth at the end; what is unknown is None."""
-    estimation = result.estimation
-    if estimation is None:
-        return {}
     units = result.system.units
     kinds = (
         (estimation.names, estimation.parameters, estimation.parameters_std,
@@ -174,9 +164,7 @@ def estimates_at_end(result: RunResult, case: int) -> dict[str, dict[str, Any]]:
     return out
 
 
-def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
-    if excitation is None:
-        return None
+def _excitation(excitation: Excitation) -> dict[str, Any]:
     # Before one window has passed the trailing window is a shorter one, which is no evidence.
     full = excitation.t - excitation.t[0] >= excitation.window * (1 - 1e-9)
     levels = excitation.pe_level[full & np.isfinite(excitation.pe_level)]
@@ -194,10 +182,8 @@ def _excitation(excitation: Excitation | None) -> dict[str, Any] | None:
     }
 
 
-def _cases(estimation: EstimationResult | None, metrics: Metrics | None) -> object:
+def _cases(estimation: EstimationResult, metrics: Metrics) -> object:
     """List the cases with gains and metrics; ranges of the metrics when they are many."""
-    if estimation is None or metrics is None:
-        return None
     columns = metrics.columns
     if len(estimation.cases) <= MAX_LISTED_CASES:
         return [

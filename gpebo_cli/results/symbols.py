@@ -43,11 +43,6 @@ def number_text(value: float) -> str:
     return {"1": power, "−1": f"−{power}"}.get(mantissa, f"{mantissa}·{power}")
 
 
-def subscript(number: int) -> str:
-    """``₁₂`` for 12."""
-    return str(number).translate(_SUBSCRIPT)
-
-
 def symbol(gain: str) -> str:
     """Symbol of a gain as a paper prints it: ``gamma`` is γ, ``gamma_2`` is γ₂, ``f0`` is f₀."""
     word = gain.rstrip("0123456789").rstrip("_")

@@ -201,8 +201,6 @@ def breakpoints(tape: Tape, start: float, stop: float) -> Array:
     affine arguments of ``abs``, ``sign``, ``min`` and ``max`` are exact, changes of sign of other
     arguments isolated by bounds, see :func:`roots`, and bisected to rounding.
     """
-    if not tape.jumps:
-        return np.zeros(0)
     steps = [i.value for i in tape.instructions if i.operation == "step"]
     affine = [s.affine for s in tape.switches if s.affine is not None]
     instants = np.array([*steps, *(-offset / slope for offset, slope in affine)], dtype=float)

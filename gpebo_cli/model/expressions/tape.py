@@ -462,8 +462,6 @@ def on_their_side(
         for times in (t[moved], there)
     )
     near = (np.abs(beside - at) > _CLEAR * np.abs(beside)).any(axis=1)
-    if not near.any():
-        return t
     found = t.copy()
     found[moved[near]] = there[near]
     return found
