@@ -255,7 +255,7 @@ def test_what_comes_later_changes_no_estimate_of_the_past(estimator):
 
     one, other = found(5), found(10)
     assert one.excitation.t_c < 0.1
-    past, told = other.estimation.parameters[:, :101], np.abs(np.arange(101) / 20 - 2.6) > 0.7
+    past, told = other.estimation.parameters[:, :101], np.abs(np.arange(101) / 20 - 2.45) > 0.8
     np.testing.assert_allclose(
         one.estimation.parameters[:, told], past[:, told], rtol=1e-4, atol=1e-6
     )

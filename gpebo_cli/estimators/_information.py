@@ -38,7 +38,7 @@ _LOOKED = np.geomspace(1e-4, 1.0, 86)  # of the time: there the first data that 
 _HELD = 4  # arrays of the size of [G_z | h_z] with each
 
 _OWN = 1e-2  # times λ_min/λ_max in parameters' own units: G has errors beyond rounding
-_PART = 1e-14  # of what the largest part in Y is, over digits: a smaller one is rounding
+_PART = 1e-12  # of what the largest part in Y is: a smaller one is rounding
 _NOTHING = 1e-2  # in units of rounding: an eigenvalue that is zero
 _PRIOR = 1e-3  # of what may be rounding stands for an f₀ that nobody gave
 CLEAR = 1e-8  # λ_min/λ_max, from which on the units that are given cost no digits worth a word
@@ -263,7 +263,7 @@ class Spectrum:
         if self.units is None:
             return eta
         part = np.abs(eta) * self.units[..., None]
-        share = _PART / np.maximum(self.digits, _PART)[:, None, None]
+        share = np.maximum(_PART, _OWN * EPS / np.maximum(self.digits, EPS))[:, None, None]
         return np.where(part > share * part.max(axis=1, initial=0.0, keepdims=True), eta, 0.0)
 
     def covariance(self, alpha: float, f0: float) -> Array:
