@@ -155,18 +155,13 @@ class _Terms(NamedTuple):
     rows: IntArray  # (e,) of each entry
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
-    shape: tuple[int, int]  # (a, b + 1): how many factors rows have, and columns and the time
+    total: int  # a + b + 1: how many factors there are
     each: Array | None = None  # (a + b + 1, e) all of it, where there are few
 
     @classmethod
     def at(cls, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, ...]) -> _Terms:
         """For entries (e,) of rows i and columns j of a matrix of this shape, with τ^order each."""
-        return cls(i, shape[0] + j, order.astype(np.float64), (shape[0], shape[1] + 1))
-
-    @property
-    def total(self) -> int:
-        """How many factors there are."""
-        return sum(self.shape)
+        return cls(i, shape[0] + j, order.astype(np.float64), sum(shape) + 1)
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
@@ -205,25 +200,20 @@ class _Terms(NamedTuple):
             whole = counted @ self.each.T
             whole.flat[:: self.total + 1] += _OPEN
             return np.asarray(-np.linalg.solve(whole, counted @ logs), dtype=np.float64)
-        n, (a, b), right = self.total, self.shape, -self.transposed(logs * counts)
+        n, right = self.total, -self.transposed(logs * counts)
         with_time, own = (self.transposed(x * counts) for x in (self.of_time, 1.0))
         own[-1] = with_time[-1]
         own += _OPEN
-        if n <= _FULL:  # rows, each beside columns and the time only, are eliminated
-            beside = np.bincount(self.rows * b + self.columns - a, counts, a * b).reshape(a, b)
-            beside[:, -1] = with_time[:a]
-            left = np.diag(own[a:])
-            left[-1, :-1] = left[:-1, -1] = with_time[a:-1]
-            share = beside / own[:a, None]
-            others = np.linalg.solve(left - beside.T @ share, right[a:] - right[:a] @ share)
-            return np.concatenate([right[:a] / own[:a] - share @ others, others])
-        from scipy.sparse import csc_array
-        from scipy.sparse.linalg import splu
-
         every, last, with_time[-1] = np.arange(n), np.full(n, n - 1), 0.0
         values = np.concatenate([counts, counts, own, with_time, with_time])
         down = np.concatenate([self.rows, self.columns, every, every, last])
         across = np.concatenate([self.columns, self.rows, every, last, every])
+        if n <= _FULL:
+            whole = np.bincount(down * n + across, values, n * n).reshape(n, n)
+            return np.asarray(np.linalg.solve(whole, right), dtype=np.float64)
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
         return np.asarray(splu(csc_array((values, (down, across)), shape=(n, n))).solve(right))
 
 
