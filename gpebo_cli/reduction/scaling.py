@@ -156,7 +156,6 @@ class _Terms(NamedTuple):
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
     total: int  # a + b + 1: how many factors there are
-    each: Array | None = None  # (a + b + 1, e) all of it, where there are few
 
     @classmethod
     def at(cls, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, ...]) -> _Terms:
@@ -165,8 +164,6 @@ class _Terms(NamedTuple):
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
-        if self.each is not None:
-            return factors @ self.each
         found: Array = factors[self.rows] + factors[self.columns] + self.of_time * factors[-1]
         return found
 
@@ -195,11 +192,6 @@ class _Terms(NamedTuple):
         Squares count so often (e,). Singular values of a thousand states would take longer than a
         run.
         """
-        if self.each is not None:
-            counted = self.each * counts
-            whole = counted @ self.each.T
-            whole.flat[:: self.total + 1] += _OPEN
-            return np.asarray(-np.linalg.solve(whole, counted @ logs), dtype=np.float64)
         n, right = self.total, -self.transposed(logs * counts)
         with_time, own = (self.transposed(x * counts) for x in (self.of_time, 1.0))
         own[-1] = with_time[-1]
@@ -230,7 +222,7 @@ def _balancing(
         return terms, partial(terms.nearest, counts)
     each = np.array([terms @ factor for factor in np.eye(terms.total)])
     inverse = np.linalg.pinv((each * counts) @ each.T, rcond=_SINGULAR, hermitian=True)
-    return terms._replace(each=each), partial(np.matmul, -inverse @ (each * counts))
+    return terms, partial(np.matmul, -inverse @ (each * counts))
 
 
 def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
