@@ -410,18 +410,10 @@ def _without_others(
             others.append((c, row, _NOTHING if known is None else known))
             own = level.pop(i)
             mu = max(mu, own)
-            if not free:
-                _differentiated(A, equation_of, c, row, known)
-                level[equation_of.pop(c)] = own + 1
+            if not free:  # the equation of x_c' becomes one without derivatives
+                j = equation_of.pop(c)
+                A.add_derivatives(j, row, known)
+                for k, a in row.items():
+                    A.add(j, a, A.row(equation_of[k]), A.known.get(equation_of[k]))
+                level[j] = own + 1
     return others, mu
-
-
-def _differentiated(
-    A: _Equations, equation_of: dict[int, int], c: int, row: Row, known: Array | None
-) -> None:
-    """The equation of x_c' becomes one without derivatives."""
-    i = equation_of[c]
-    A.add_derivatives(i, row, known)
-    for k, a in row.items():
-        A.add(i, a, A.row(equation_of[k]), A.known.get(equation_of[k]))
-
