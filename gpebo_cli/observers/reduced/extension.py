@@ -42,7 +42,6 @@ class Extension:
     error_estimate: float  # relative to each signal's own size, the largest
     assembled: Assembled
     scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
-    units: Array  # (k,) of the coordinates
     weakest: tuple[float, float]  # smallest singular value behind Assumption 1, and its time
     asked: Array | None = None  # (M,) times of the assembled offset and gain; None: all points
 
@@ -73,14 +72,14 @@ class Extension:
             self, asked=t, assembled=replace(self.assembled, offset=offset, gain=gain)
         )
 
-    def growth(self, q: int) -> tuple[float, float]:
+    def growth(self, reduced: ReducedSystem) -> tuple[float, float]:
         """Largest entry of Φ in comparable units, in which its columns start at size 1.
 
         And ln ‖Φ(end)‖₂, which is 0 at the start.
         """
         values = self.trajectory.values
         some = np.stack([values[0, 0], self.assembled.largest, values[-1, -1]])
-        Phi = comparable(some[..., 1 + q :], self.units)
+        Phi = comparable(some[..., 1 + reduced.system.q :], reduced.units)
         return largest_entry(Phi), log_norm(Phi[-1])
 
 
@@ -239,7 +238,7 @@ def joined(parts: Iterable[Extension]) -> Extension:
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
-        np.maximum.accumulate(scale, axis=0, out=scale), part.units, min(weak), asked,
+        np.maximum.accumulate(scale, axis=0, out=scale), min(weak), asked,
     )
 
 
@@ -277,8 +276,7 @@ def _assembled(
     error, rounding = solution.error_estimate, reduced.first.rounding
     if rounding is not None:
         error = max(error, found.lost(EPS * rounding))
-    trajectory = Trajectory(mesh, values)
-    return Extension(trajectory, error, found, sizes, reduced.units, (smallest, at))
+    return Extension(Trajectory(mesh, values), error, found, sizes, (smallest, at))
 
 
 def _over_time(signal: Array) -> Array:

@@ -111,7 +111,7 @@ class CurrentCoordinates:
                 past = times[:, largest_at(v for v, _ in seen)]
                 yield Extension(
                     mesh.trajectory(rows[front:]), error, a.after(front),
-                    np.broadcast_to(a.column_scale, (mesh.size, p)), reduced.units, smallest,
+                    np.broadcast_to(a.column_scale, (mesh.size, p)), smallest,
                 )
 
         found = joined(kept_of(parts(), reduced.mesh, reduced.signals.asked))

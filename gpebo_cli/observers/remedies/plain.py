@@ -28,7 +28,7 @@ class Plain:
             reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
             extension.trajectory, reduced.units,
         )
-        return observation(reduced, extension, *extension.growth(reduced.system.q), truth)
+        return observation(reduced, extension, *extension.growth(reduced), truth)
 
 
 def observation(

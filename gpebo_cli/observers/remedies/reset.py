@@ -85,7 +85,7 @@ class Resets:
             known = known.after(resets[-1])
             later.append((time, begin.dual, begin.dual @ xi_a))
         segments = joined(extensions)
-        growth, logarithms = zip(*(e.growth(reduced.system.q) for e in extensions), strict=True)
+        growth, logarithms = zip(*(e.growth(reduced) for e in extensions), strict=True)
         at_start = reduced.begin.dual
         truth = InitialError(
             at_start, at_start @ reduced.xi_a, dual, segments.trajectory, reduced.units,
