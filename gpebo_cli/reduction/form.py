@@ -128,18 +128,19 @@ class EquationForm:
         both = compress((*self.system.inputs, *self.system.outputs), noisy)
         return tuple(name for name in both if name in names)
 
-    def driving(self, t: Array, inside: Array, u: Array) -> Array:
-        """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
+    def driving(self, t: Array, inside: Array, signals: Array) -> Array:
+        """[v; y] (N, v + r, 1) at the times t (N,), from the measured [u; y] (N, m + r)."""
         if not (self.derivatives or self.known_term):
-            return u
-        parts = [u]
+            return signals[:, :, None]
+        m = self.system.m
+        parts = [signals[:, :m]]
         if self.derivatives and self.inputs is not None:
             order = max(k for k, _ in self.derivatives)
             taylor = self.inputs.taylor(t, inside, order)
             parts += [taylor[k, :, j : j + 1] for k, j in self.derivatives]
         if self.known_term:
-            parts.append(np.ones((len(u), 1)))
-        return np.concatenate(parts, axis=1)
+            parts.append(np.ones((len(signals), 1)))
+        return np.concatenate([*parts, signals[:, m:]], axis=1)[:, :, None]
 
     def equations(
         self, t: Array, inside: Array, signals: Array | None, slopes: Array | float = 0.0

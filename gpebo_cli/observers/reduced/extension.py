@@ -28,7 +28,7 @@ from gpebo_cli.observers.reduced.regression import (
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, units_along
-from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem, measured
+from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem
 from gpebo_cli.simulation import ivp
 
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
@@ -116,9 +116,9 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
     windows = [mesh] if large or solver.name == "ivp" else mesh.windows()
     if windows[0] is signals.mesh and reduced.injection is None and solver.name != "ivp":
-        u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
-        points, inside = _over_time(mesh.points), _over_time(mesh.inside)
-        known = equations(reduced.first, measured(reduced.form, points, inside, u, y))
+        both = np.concatenate([signals.inputs.values, signals.outputs.values], axis=2)
+        driving = reduced.form.driving(*map(_over_time, (mesh.points, mesh.inside, both)))
+        known = equations(reduced.first, driving)
     marched = series.solve_dense(problem, mesh, **limits, known=known) if large else None
     if marched is not None:
         return _assembled(reduced, units, marched, monitor.latest, as_found=True)

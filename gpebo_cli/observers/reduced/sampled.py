@@ -39,13 +39,7 @@ from gpebo_cli.observers.reduced.regression import (
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, split_in_frame
-from gpebo_cli.observers.reduced.system import (
-    Formulation,
-    begin_at,
-    choose_form,
-    measured,
-    start_at,
-)
+from gpebo_cli.observers.reduced.system import Formulation, begin_at, choose_form, start_at
 from gpebo_cli.recordings.hold import Hold, each_of, edges, held, of_outputs
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
@@ -155,8 +149,7 @@ class SampledObserver(Formulation):
                 f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
                 f"before t = {t[-1]:.6g}; the observer needs it constant"
             )
-        m = self.system.m
-        return o, measured(self.form, t, inside, signals[:, :m], signals[:, m:])
+        return o, self.form.driving(t, inside, signals)
 
     def _block(
         self, z: Array, t: Array, signals: Array, before: SampledState | None, step: Array | None,
@@ -219,8 +212,7 @@ def sampled_observer(
         eye = np.eye(system.n)
         split = replace(first.split, basis=eye, dual=eye, frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
-    u, y = np.split(sample[None], [system.m], axis=1)
-    begin = start_at(used, first, measured(used, t, t, u, y))
+    begin = start_at(used, first, used.driving(t, t, sample[None]))
     xi = begin_at(xi_a0, used, first, begin)
     return SampledObserver(used, solver, first, begin, xi, regression, note, hold)
 
