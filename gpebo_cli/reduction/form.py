@@ -186,7 +186,7 @@ class EquationForm:
 
         They follow no signal; any at which the other matrices have values will do.
         """
-        along = None if signals is None else signals[None]
+        along = self.along(t, inside, signals, 0)
         return np.asarray(self.system.coefficients.taylor(t, order, inside, along).E[order])
 
     def along(

@@ -139,10 +139,8 @@ class SampledObserver(Formulation):
         self, t: Array, inside: Array, signals: Array
     ) -> tuple[ObserverMatrices, Array]:
         """The matrices at the times t (N,), and [v; y] (N, · + r, 1) from [u; y] (N, m + r)."""
-        o = observer_matrices(
-            self.form, t, inside, self.solver.rank_tol, self.first,
-            signals=signals if self.system.followed else None,
-        )
+        rank_tol = self.solver.rank_tol
+        o = observer_matrices(self.form, t, inside, rank_tol, self.first, signals=signals)
         rank = self.first.split.rank
         if o.split.rank != rank:
             raise ModelError(
@@ -227,6 +225,6 @@ def _kernel_is_fixed(
     frame = first.split.frame
     if frame is None:
         return False
-    signals = np.repeat(sample[None], len(t), axis=0) if form.system.followed else None
+    signals = np.repeat(sample[None], len(t), axis=0)
     E = form.mass(t, t, signals) / form.units.equations[:, None]
     return split_in_frame(E, frame, form.units.states, rank_tol) is not None
