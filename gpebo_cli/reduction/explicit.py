@@ -269,15 +269,13 @@ class _Equations:
         """A state among ``allowed`` that row i can give, in as few other rows as possible."""
         row = self.row(i)
         sizes = {k: _size(row[k]) * self.units[k] for k in allowed}
-        if not sizes:
-            raise UndecidedError  # an equation that says nothing
-        largest = max(sizes.values())
+        largest = max(sizes.values(), default=0.0)
         smallest = {k: float(np.abs(row[k][0]).min()) * self.units[k] for k in sizes}
         fit = [
             k for k, size in sizes.items()
             if size >= _SOUND * largest and smallest[k] >= _STEADY * size > 0.0
         ]
-        if not fit:
+        if not fit:  # as of an equation that says nothing
             raise UndecidedError
         chosen = min(fit, key=lambda k: (len(self.where(k)), -sizes[k], k))
         self.least = min(self.least, smallest[chosen] / largest)
