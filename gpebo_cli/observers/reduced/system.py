@@ -162,9 +162,8 @@ class ReducedSystem(Formulation):
 
     def assumptions(self, weakest: tuple[float, float]) -> tuple[Assumption, ...]:
         """Rank of E and Assumption 1: the ``weakest`` singular value, and its time."""
-        frame = self.first.split.frame
-        left = None if frame is None else frame.remaining
-        rank = self.first.split.rank + (0 if left is None else left.given_up.shape[1])
+        split = self.first.split
+        rank = split.rank if split.frame is None else split.frame.domain.shape[1]
         of = "smallest_singular_value" + ("" if self.lost is None else "_of_the_rest")
         evidence = dict(zip((of, "at"), weakest, strict=True))
         return self.needed(rank, evidence, holds=self.lost is None)
