@@ -17,7 +17,7 @@ from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Samples, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import largest_entry, log_norm
+from gpebo_cli.observers._base import log_norm
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMatrices, weakest
 from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
@@ -80,7 +80,7 @@ class Extension:
         values = self.trajectory.values
         some = np.stack([values[0, 0], self.assembled.largest, values[-1, -1]])
         Phi = comparable(some[..., 1 + reduced.system.q :], reduced.units)
-        return largest_entry(Phi), log_norm(Phi[-1])
+        return float(np.abs(Phi).max(initial=0.0)), log_norm(Phi[-1])
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:

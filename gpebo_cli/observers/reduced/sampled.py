@@ -24,13 +24,7 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import (
-    ByName,
-    InitialError,
-    SampledBlock,
-    largest_entry,
-    log_norm,
-)
+from gpebo_cli.observers._base import ByName, InitialError, SampledBlock, log_norm
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
@@ -159,7 +153,7 @@ class SampledObserver(Formulation):
         equations = o.equations(driving)
         assembled = regression_signals(z, system.q, basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
-        growth = largest_entry(Phi[1:])
+        growth = float(np.abs(Phi[1:]).max(initial=0.0))
         smallest = float(o.injectivity.min())
         of_gain, scale = term_sizes(z, system.q, basis, equations)
         if basis.shape[1] > o.split.rank:
