@@ -116,8 +116,6 @@ class TextRegression:
             if right is None:
                 assert Y is not None  # noqa: S101  a source gives it
                 right = Y(mesh.points.ravel(), mesh.inside.ravel())
-            psi = psi.reshape(*mesh.points.shape, self.rows, -1)
-            right = right.reshape(*mesh.points.shape, self.rows)
             kinds = [*columns[0].T, psi, right, outer_products(psi, right)]
             return (psi, right), [(kind.reshape(*mesh.points.shape, -1), 0.0) for kind in kinds]
 
@@ -126,7 +124,7 @@ class TextRegression:
             name=f"regression {self.system.name}",
         )
         regression = LinearRegression(
-            Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
+            mesh.trajectory(right), mesh.trajectory(psi), self.system.unknowns,
             float(np.abs(psi).max(initial=0.0)), parametrisation=self.parametrisation,
         )
         return regression, error
