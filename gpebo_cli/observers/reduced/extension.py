@@ -90,9 +90,8 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     large = len(start) > SMALL and solver.name != "ivp"
 
     # What is integrated is in comparable units, as written where these are.
-    of_rows, of_columns = reduced.units, np.ones(columns)
-    of_columns[1 : 1 + q] = reduced.form.units.unknowns
-    of_columns[1 + q :] = units_along(start[:, 1 + q :], of_rows)
+    of_rows, of_unknowns = reduced.units, reduced.form.units.unknowns
+    of_columns = np.concatenate([[1.0], of_unknowns, units_along(start[:, 1 + q :], of_rows)])
     units = of_rows[:, None] / of_columns
     plain = bool((units == 1.0).all())
 
@@ -155,9 +154,7 @@ class _Monitor:
             ]
         z, *seen = map(_over_time, self._whole)
         equations = AlgebraicEquations(*seen)
-        self.latest = regression_signals(
-            z, self._reduced.system.q, self._reduced.basis, equations
-        )
+        self.latest = regression_signals(z, self._reduced.basis, equations)
         if (self.latest.largest / self.units).max(initial=0.0) > _LARGEST:
             raise SolverError(
                 f"the dynamic extension of plant {self._reduced.system.name} grows beyond "
@@ -263,7 +260,7 @@ def _assembled(
             _over_time(e if e.shape[:2] == (1, 1) else e[part, places])
             for e in (values, *solution.extras)
         )
-        of_gain, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
+        of_gain, sizes = term_sizes(z, reduced.basis, AlgebraicEquations(*seen))
         elements = len(sizes) // 3
         scale.append(sizes.reshape(elements, 3, sizes.shape[1]).max(axis=1))
         if not as_found:

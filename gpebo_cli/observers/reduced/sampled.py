@@ -151,11 +151,11 @@ class SampledObserver(Formulation):
         system, basis = self.system, self.basis
         o, driving = self._matrices(t, t, signals)
         equations = o.equations(driving)
-        assembled = regression_signals(z, system.q, basis, equations)
+        assembled = regression_signals(z, basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
         growth = float(np.abs(Phi[1:]).max(initial=0.0))
         smallest = float(o.injectivity.min())
-        of_gain, scale = term_sizes(z, system.q, basis, equations)
+        of_gain, scale = term_sizes(z, basis, equations)
         if basis.shape[1] > o.split.rank:
             # What the kernel of E, which turns, leaves of z holds but for errors of z's own size.
             own = (np.abs(z[:, :, 1:]) / self.units[:, None]).max(axis=1, initial=0.0)[:, None]
