@@ -275,8 +275,7 @@ def strangeness_free(
         if name in system.followed and structure.mu and (inputs is None or not inputs.known[j]):
             raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
-    if found is None:
-        return whole
+    assert found is not None  # noqa: S101  there is a structure
     if structure.mu and signals is not None:
         _refuse_slopes(whole, found, t, inside, signals)
     m, orders = system.m, np.arange(structure.mu + 1)
