@@ -53,10 +53,9 @@ class Extension:
     @property
     def state_map(self) -> tuple[Trajectory, Trajectory]:
         """Offset (n,) and gain (n, p) of the state."""
-        found, mesh = self.assembled, self.mesh
-        if self.asked is None:
-            return mesh.trajectory(found.offset), mesh.trajectory(found.gain)
-        return mesh.sampled(self.asked, found.offset), mesh.sampled(self.asked, found.gain)
+        mesh, found = self.mesh, self.assembled
+        signal = mesh.trajectory if self.asked is None else partial(mesh.sampled, self.asked)
+        return signal(found.offset), signal(found.gain)
 
     def rows(self, kept: IntArray) -> tuple[Trajectory, Trajectory]:
         """Y (rows,) and ψ (rows, p) of the rows that are ``kept`` (rows,)."""
@@ -66,8 +65,7 @@ class Extension:
 
     def kept_at(self, t: Array) -> Extension:
         """The same with the state's offset and gain at the times t (M,) only."""
-        sampler = self.mesh.sampler(t)
-        offset, gain = (sampler(signal.values) for signal in self.state_map)
+        offset, gain = (signal(t) for signal in self.state_map)
         return replace(
             self, asked=t, assembled=replace(self.assembled, offset=offset, gain=gain)
         )
