@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import AffineStateMap, InitialError, Measurements, Observation
@@ -68,9 +68,7 @@ def lean(
         t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
         full = regression.Y(t, t_in) + added.values[at, 0, :r, 0]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
-        factor = np.asarray(
-            np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
-        )
+        factor = triangular([np.concatenate([factor, own.reshape(-1, p + 1)])])
         count += len(at)
         if rows:
             at_rows += [
