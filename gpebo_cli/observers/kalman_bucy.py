@@ -76,13 +76,13 @@ class FilterModel:
     Squares ``terms`` are of what c is made of, which does not cancel.
     """
 
-    A: Array  # (N, n, n) of ζ
+    A: Array  # (N or 1, n, n) of ζ
     b: Array  # (N, n)
     c: Array  # (N, e + r, n)
     terms: Array  # (N or 1, e + r, n)
     rows: Array  # (N, e + r, r) Z
     g_y: Array  # (N, e + r)
-    from_noise: Array  # (N, n, m + r) Γ
+    from_noise: Array  # (N or 1, n, m + r) Γ
     in_measurement: Array  # (N, e + r, m + r), D = Zᵀ that
     offset: Array  # (N, states) x_y
     gain: Array  # (N, states, n) [X_θ, X_w]
@@ -100,15 +100,13 @@ def filter_model(
     """
     count, r, basis = len(signals), o.outputs, o.split.basis
     q, k = o.from_unknowns.shape[2], basis.shape[1]
-    A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
     inside = _inside(q, o.split)
     own = units_along(basis, form.units.states)
     rate = np.linalg.norm(o.dynamics * own / own[:, None], axis=(1, 2))
     damping = rate[:, None, None] * (np.eye(k) - inside[:, q:, q:])
-    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
-    inward = np.zeros((count, q + k, signals.shape[1]))
-    inward[:, q:] = o.from_signals
+    moving = joined(o.from_unknowns, o.dynamics - damping, axis=2)
+    A, inward = (np.pad(rows, ((0, 0), (q, 0), (0, 0))) for rows in (moving, o.from_signals))
     g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
     c = joined(o.G, o.on_basis, axis=2)
     c = np.broadcast_to(c, (count, *c.shape[1:]))
@@ -410,8 +408,7 @@ def _errors(s: FilterModel, P: Array, noise: NoiseModel) -> ErrorSystem:
     L = transpose(np.asarray(transposed, dtype=np.float64))
     inward = L @ transpose(s.rows) @ s.in_measurement - s.from_noise
     n = P.shape[-1]
-    C = np.zeros((1, n + s.direct.shape[1], n))
-    C[0, :n] = np.eye(n)
+    C = np.eye(n + s.direct.shape[1], n)[None]
     D = np.concatenate([np.zeros_like(inward), s.direct], axis=1)
     return ErrorSystem(m.A - L @ m.c, inward, C, D)
 
