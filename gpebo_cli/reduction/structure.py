@@ -252,10 +252,9 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
     there, n = slice(middle, middle + 1), len(of.rows)
     E, A = (x if x.shape[1] == 1 else x[:, there] for x in (c.E, c.A))
     e, aa = scaled(E, A, of.rows, of.columns, of.time, len(E))
-    beside = np.zeros((3, n, 2 * n))
-    beside[:2, :, :n], beside[2, :, :n] = e[0, 0], e[0, 0].T
-    beside[1, :, n:], beside[2, :, n:] = aa[0, 0], aa[0, 0].T
-    spread = np.linalg.svd(beside, compute_uv=False).tolist()
+    now = e[0, 0], aa[0, 0]
+    beside = now[0], np.hstack(now), np.vstack(now)
+    spread = [np.linalg.svd(x, compute_uv=False).tolist() for x in beside]
     if not any(rank_tol * s[0] < value < _APART * s[0] for s in spread for value in s):
         return False
     try:
