@@ -287,8 +287,7 @@ def strangeness_free(
         if inputs is None or not inputs.known[j]:
             # M is a projector: its rows, weighted by the column of the derivative, are that.
             weight = driving[:, m * k + j]
-            of = [x for x, w in zip(system.states, weight, strict=True)
-                  if w > _ABSENT * weight.max()]
+            of = [*compress(system.states, weight > _ABSENT * weight.max())]
             raise ConfigError(_unknown(
                 system, system.inputs[j],
                 f"a hidden constraint on {listed(of)} contains its derivative of order {k}",
