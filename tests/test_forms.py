@@ -514,7 +514,7 @@ def test_hidden_constraints_hold_on_the_solution():
     assert form.structure.mu == 2
     assert form.derivatives == ()
     hidden = form.equations(t, t, None).hidden
-    v = form.driving(t, t, signals.inputs(t))
+    v = form.driving(t, t, signals.inputs(t))[:, :, 0]
     left = np.einsum("nij,nj->ni", hidden.states, signals.states(t))
     left += np.einsum("nij,nj->ni", hidden.driving, v) + hidden.unknowns @ system.theta
     assert np.abs(left).max() < 1e-10

@@ -244,11 +244,6 @@ def log_norm(Phi: Array) -> float:
     return float(np.log(max(sigma.max(initial=0.0 if Phi.size else 1.0), np.finfo(float).tiny)))
 
 
-def largest_entry(values: Array) -> float:
-    """Size of the largest entry of values (…, columns)."""
-    return float(max(values.max(initial=0.0), -values.min(initial=0.0)))  # without a copy
-
-
 @dataclass(frozen=True, eq=False)
 class Observation:
     """The observer's output.

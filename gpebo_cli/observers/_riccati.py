@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpebo_cli.errors import SolverError
+from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.linalg import transpose
@@ -52,7 +53,7 @@ _GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
 
 
 class StateSpace(NamedTuple):
-    """The linear model and its noise at N times; ``g`` columns of signals share one P."""
+    """The linear model and its noise at N times, or 1; ``g`` columns of signals share one P."""
 
     A: Array  # (N, n, n)
     b: Array  # (N, n, g)
@@ -65,16 +66,16 @@ class StateSpace(NamedTuple):
 
 def hamiltonian(model: StateSpace) -> tuple[Array, Array]:
     """Matrix (N, 2n, 2n) and inhomogeneity (N, 2n, n + g) of the linear equation above."""
-    n, g = model.A.shape[-1], model.b.shape[-1]
-    weighted = np.linalg.solve(model.V, np.concatenate([model.c, model.z], axis=-1))
+    n, g, count = model.A.shape[-1], model.b.shape[-1], max(map(len, model))
+    weighted = np.linalg.solve(model.V, joined(model.c, model.z, axis=2))
     from_state, from_signal = weighted[..., :n], weighted[..., n:]  # V⁻¹c, V⁻¹z
     A = model.A - model.N @ from_state
     Q = model.Q - model.N @ np.linalg.solve(model.V, transpose(model.N))
     W = transpose(model.c) @ from_state
-    H = np.empty((len(A), 2 * n, 2 * n))
+    H = np.empty((count, 2 * n, 2 * n))
     H[:, :n, :n], H[:, :n, n:] = -transpose(A), 0.5 * (W + transpose(W))
     H[:, n:, :n], H[:, n:, n:] = 0.5 * (Q + transpose(Q)), A
-    f = np.zeros((len(A), 2 * n, n + g))
+    f = np.zeros((count, 2 * n, n + g))
     f[:, :n, n:] = -transpose(model.c) @ from_signal
     f[:, n:, n:] = model.b + model.N @ from_signal
     return H, f

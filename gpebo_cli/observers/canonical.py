@@ -205,7 +205,6 @@ def _outputs_without_zb(system: DescriptorSystem, blocks: Blocks) -> list[int]:
 class UnknownInputObserver:
     """Proposition 4's matrices on a mesh, everything but the estimate of z_a."""
 
-    mesh: Mesh
     M: Trajectory  # (2, 2) M_w
     from_y: Trajectory  # (2,) M_w G_w + L_w − Ġ_w
     forcing: Trajectory  # (2,) [I − G_w c⊤] d_w
@@ -279,8 +278,8 @@ def _unknown_input_observer(
     algebraic = np.stack([-f_b[:, 0], c[:, 0] * f_b[:, 0] / c[:, 1]], axis=1)
     on_mesh = mesh.trajectory
     return UnknownInputObserver(
-        mesh, on_mesh(M), on_mesh(from_y), on_mesh(forcing), on_mesh(1.0 / c[:, 1]),
-        on_mesh(y[:, ell]), on_mesh(b.C[:, ell, :n_a]), on_mesh(algebraic), third, start,
+        on_mesh(M), on_mesh(from_y), on_mesh(forcing), on_mesh(1.0 / c[:, 1]), on_mesh(y[:, ell]),
+        on_mesh(b.C[:, ell, :n_a]), on_mesh(algebraic), third, start,
         (system.states[n_a], system.states[n_a + 1]),
         _assumptions(system, b.N, c, on_mesh(M), ell),
     )
@@ -381,7 +380,7 @@ class CanonicalStateMap(StateMap):
     @property
     def times(self) -> Array:
         """The times at which the observer for z_b needs ẑ_a."""
-        return np.zeros(0) if self.zb is None else self.zb.mesh.points.ravel()
+        return np.zeros(0) if self.zb is None else self.zb.M.mesh.points.ravel()
 
     def at(self, t: Array) -> Reconstruction:
         """Sample all at the times t (M,) once; each batch of cases is one integration."""
@@ -397,22 +396,19 @@ class CanonicalStateMap(StateMap):
 
     def checks(self, t: Array, states: Array) -> Mapping[str, Array]:
         """Algebraic z_b1 = −f_b1 and z_b2 = (y_w + c1 f_b1)/c2, (g, M), from x̂ (g, M, n)."""
-        if self.zb is None:
+        if (zb := self.zb) is None:
             return {}
-        za = states[..., : self.n_a]
-        sampler = self.zb.mesh.sampler(t)
-        y_w = sampler(self.zb.y.values) - np.sum(sampler(self.zb.C_a.values) * za, axis=2)
-        known = sampler(self.zb.algebraic.values)
-        first, second = self.zb.names
+        y_w = zb.y(t) - np.sum(zb.C_a(t) * states[..., : self.n_a], axis=2)
+        known, (first, second) = zb.algebraic(t), zb.names
         return {
             f"{first}_algebraic": np.broadcast_to(known[:, 0], y_w.shape),
-            f"{second}_algebraic": known[:, 1] + sampler(self.zb.G2.values) * y_w,
+            f"{second}_algebraic": known[:, 1] + zb.G2(t) * y_w,
         }
 
 
 def estimate_zb(zb: UnknownInputObserver, t: Array, za: Array) -> Array:
     """(ẑ_b1, ẑ_b2, ẑ_b3) at the times t (M,) from ẑ_a (g, M, n_a) there, shape (g, M, 3)."""
-    mesh, g = zb.mesh, len(za)
+    mesh, g = zb.M.mesh, len(za)
     where = np.searchsorted(t, mesh.points.ravel())
     points = za[:, np.clip(where, 0, len(t) - 1)].reshape(g, *mesh.points.shape, -1)
     y_w = np.moveaxis(zb.y.values - np.sum(zb.C_a.values * points, axis=-1), 0, -1)

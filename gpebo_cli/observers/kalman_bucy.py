@@ -76,13 +76,13 @@ class FilterModel:
     Squares ``terms`` are of what c is made of, which does not cancel.
     """
 
-    A: Array  # (N, n, n) of ζ
+    A: Array  # (N or 1, n, n) of ζ
     b: Array  # (N, n)
     c: Array  # (N, e + r, n)
     terms: Array  # (N or 1, e + r, n)
     rows: Array  # (N, e + r, r) Z
     g_y: Array  # (N, e + r)
-    from_noise: Array  # (N, n, m + r) Γ
+    from_noise: Array  # (N or 1, n, m + r) Γ
     in_measurement: Array  # (N, e + r, m + r), D = Zᵀ that
     offset: Array  # (N, states) x_y
     gain: Array  # (N, states, n) [X_θ, X_w]
@@ -100,15 +100,13 @@ def filter_model(
     """
     count, r, basis = len(signals), o.outputs, o.split.basis
     q, k = o.from_unknowns.shape[2], basis.shape[1]
-    A = np.zeros((count, q + k, q + k))
     # w = P w. The range of P(t) turns; rounding outside of it is damped, or it would grow.
     inside = _inside(q, o.split)
     own = units_along(basis, form.units.states)
     rate = np.linalg.norm(o.dynamics * own / own[:, None], axis=(1, 2))
     damping = rate[:, None, None] * (np.eye(k) - inside[:, q:, q:])
-    A[:, q:, :q], A[:, q:, q:] = o.from_unknowns, o.dynamics - damping
-    inward = np.zeros((count, q + k, signals.shape[1]))
-    inward[:, q:] = o.from_signals
+    moving = joined(o.from_unknowns, o.dynamics - damping, axis=2)
+    A, inward = (np.pad(rows, ((0, 0), (q, 0), (0, 0))) for rows in (moving, o.from_signals))
     g = np.broadcast_to(o.g_signals, (count, *o.g_signals.shape[1:]))
     c = joined(o.G, o.on_basis, axis=2)
     c = np.broadcast_to(c, (count, *c.shape[1:]))
@@ -296,7 +294,6 @@ class KalmanBucy:
             filtered = _along_all(filtered, signals, few, solver, lambda t, inside: _errors(
                 reduced(t, inside), filtered.at(t, inside)[0], model_noise
             ))
-        offset, gain, direct = filtered.extras
 
         def information(t: Array, inside: Array) -> tuple[Array, Array]:
             m = model_noise.state_space(reduced(t, inside))
@@ -311,10 +308,7 @@ class KalmanBucy:
         observability = _uniform_observability(gramians, P0, known, sizes)
         return Observation(
             regression=evidence.regression,
-            state_map=FilterStateMap(
-                filtered, AffineStateMap(offset, gain), direct,
-                noise.variances + (np.nan if unknown else 0.0),
-            ),
+            state_map=FilterStateMap(filtered, noise.variances + (np.nan if unknown else 0.0)),
             truth=CurrentState(known),
             error_estimate=filtered.error_estimate,
             assumptions=(
@@ -410,8 +404,7 @@ def _errors(s: FilterModel, P: Array, noise: NoiseModel) -> ErrorSystem:
     L = transpose(np.asarray(transposed, dtype=np.float64))
     inward = L @ transpose(s.rows) @ s.in_measurement - s.from_noise
     n = P.shape[-1]
-    C = np.zeros((1, n + s.direct.shape[1], n))
-    C[0, :n] = np.eye(n)
+    C = np.eye(n + s.direct.shape[1], n)[None]
     D = np.concatenate([np.zeros_like(inward), s.direct], axis=1)
     return ErrorSystem(m.A - L @ m.c, inward, C, D)
 
@@ -499,8 +492,6 @@ class FilterStateMap(Filtering):
     """x̂ = offset + gain ζ̂, and what the filter's covariance means for the state."""
 
     filtered: Filtered
-    affine: AffineStateMap
-    direct: Trajectory  # (states, m + r)
     variances: Array  # (m + r,) of ν
 
     @property
@@ -511,12 +502,13 @@ class FilterStateMap(Filtering):
 
     def at(self, t: Array) -> Reconstruction:
         """The affine map at the times t (M,), ascending."""
-        return self.affine.at(t)
+        offset, gain, _ = self.filtered.extras
+        return AffineStateMap(offset, gain).at(t)
 
     def deviations(self, t: Array) -> tuple[Array, Array]:
         """Standard deviations of ζ̂ (M, n) and of x̂ (M, states), NaN if nobody knows the noise."""
         P, _ = self.filtered.at(t)
-        gain, direct = self.affine.gain(t), self.direct(t)
+        _, gain, direct = (signal(t) for signal in self.filtered.extras)
         of_state = np.einsum("mij,mjk,mik->mi", gain, P, gain)
         of_state += direct**2 @ self.variances
         own = np.einsum("mii->mi", P) + 0.0 * self.variances.sum()

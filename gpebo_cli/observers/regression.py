@@ -157,8 +157,7 @@ def _text_of(system: DescriptorSystem) -> TextRegression:
 
 def _errors_of_outputs(system: DescriptorSystem, rows: int) -> ErrorsAt:
     """Errors of [signals; Y] as a linear system without a state: what they add to Y."""
-    D = np.zeros((1, rows + system.n, system.m + rows))
-    D[0, :rows, system.m :] = np.eye(rows)
+    D = np.eye(rows + system.n, system.m + rows, system.m)[None]
     none = np.zeros((1, 0, 0))
     found = ErrorSystem(none, np.zeros((1, 0, D.shape[2])), np.zeros((1, D.shape[1], 0)), D)
     return lambda _t, _inside: found

@@ -31,7 +31,7 @@ class ConstantForm:
     dynamics: Array  # (d, d) M
     basis: Array  # (n, d) T
     inverse: Array  # (d, n) z = this x
-    constraints: Array  # (μ + 1, n, n) offset = Σ this f^(j)
+    constraints: Array  # (μ + 1, n, n) offset = Σ this f_j, Taylor coefficients
     forced: Array  # (d, n) f = this f(t) + ``through`` offset
     through: Array  # (d, n)
     mu: int
@@ -46,14 +46,9 @@ class ConstantForm:
         """With what is known in the equations (orders, N, n); MoreOrdersError: too few."""
         if len(f) < len(self.constraints):
             raise MoreOrdersError
-        offset = sum(
-            (factorial(j) * f[j] @ S.T for j, S in enumerate(self.constraints)),
-            np.zeros(f.shape[1:]),
-        )
-        known = sum(
-            factorial(j) * np.abs(S) @ np.abs(f[j]).max(axis=0)
-            for j, S in enumerate(self.constraints)
-        )
+        terms = [*zip(f, self.constraints, strict=False)]
+        offset = sum((x @ S.T for x, S in terms), np.zeros(f.shape[1:]))
+        known = sum(np.abs(S) @ np.abs(x).max(axis=0) for x, S in terms)
         return replace(
             self, offset=offset, known=known, f=f[0] @ self.forced.T + offset @ self.through.T
         )
@@ -132,7 +127,7 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     # may be small differences.
     explicit = np.linalg.solve(Z1.T @ e @ free, Z1.T @ np.concatenate([a, e, np.eye(n)], axis=1))
     of_a, of_e, of_f = (explicit[:, k * n : (k + 1) * n] for k in range(3))
-    powers = time ** np.arange(levels)[:, None, None]
+    powers = np.array([[[factorial(j) * time**j]] for j in range(levels)])  # f^(j) is j! f_j
     return ConstantForm(
         of_a @ free / time, columns[:, None] * free, of_e / columns,
         constrained @ known_in * powers * rows, of_f * rows / time, of_a / columns / time,

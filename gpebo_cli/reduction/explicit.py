@@ -269,15 +269,13 @@ class _Equations:
         """A state among ``allowed`` that row i can give, in as few other rows as possible."""
         row = self.row(i)
         sizes = {k: _size(row[k]) * self.units[k] for k in allowed}
-        if not sizes:
-            raise UndecidedError  # an equation that says nothing
-        largest = max(sizes.values())
+        largest = max(sizes.values(), default=0.0)
         smallest = {k: float(np.abs(row[k][0]).min()) * self.units[k] for k in sizes}
         fit = [
             k for k, size in sizes.items()
             if size >= _SOUND * largest and smallest[k] >= _STEADY * size > 0.0
         ]
-        if not fit:
+        if not fit:  # as of an equation that says nothing
             raise UndecidedError
         chosen = min(fit, key=lambda k: (len(self.where(k)), -sizes[k], k))
         self.least = min(self.least, smallest[chosen] / largest)
@@ -410,18 +408,10 @@ def _without_others(
             others.append((c, row, _NOTHING if known is None else known))
             own = level.pop(i)
             mu = max(mu, own)
-            if not free:
-                _differentiated(A, equation_of, c, row, known)
-                level[equation_of.pop(c)] = own + 1
+            if not free:  # the equation of x_c' becomes one without derivatives
+                j = equation_of.pop(c)
+                A.add_derivatives(j, row, known)
+                for k, a in row.items():
+                    A.add(j, a, A.row(equation_of[k]), A.known.get(equation_of[k]))
+                level[j] = own + 1
     return others, mu
-
-
-def _differentiated(
-    A: _Equations, equation_of: dict[int, int], c: int, row: Row, known: Array | None
-) -> None:
-    """The equation of x_c' becomes one without derivatives."""
-    i = equation_of[c]
-    A.add_derivatives(i, row, known)
-    for k, a in row.items():
-        A.add(i, a, A.row(equation_of[k]), A.known.get(equation_of[k]))
-

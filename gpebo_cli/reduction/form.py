@@ -128,18 +128,19 @@ class EquationForm:
         both = compress((*self.system.inputs, *self.system.outputs), noisy)
         return tuple(name for name in both if name in names)
 
-    def driving(self, t: Array, inside: Array, u: Array) -> Array:
-        """v (N, ·) at the times t (N,), from the measured inputs u (N, m)."""
+    def driving(self, t: Array, inside: Array, signals: Array) -> Array:
+        """[v; y] (N, v + r, 1) at the times t (N,), from the measured [u; y] (N, m + r)."""
         if not (self.derivatives or self.known_term):
-            return u
-        parts = [u]
+            return signals[:, :, None]
+        m = self.system.m
+        parts = [signals[:, :m]]
         if self.derivatives and self.inputs is not None:
             order = max(k for k, _ in self.derivatives)
             taylor = self.inputs.taylor(t, inside, order)
             parts += [taylor[k, :, j : j + 1] for k, j in self.derivatives]
         if self.known_term:
-            parts.append(np.ones((len(u), 1)))
-        return np.concatenate(parts, axis=1)
+            parts.append(np.ones((len(signals), 1)))
+        return np.concatenate([*parts, signals[:, m:]], axis=1)[:, :, None]
 
     def equations(
         self, t: Array, inside: Array, signals: Array | None, slopes: Array | float = 0.0
@@ -185,7 +186,7 @@ class EquationForm:
 
         They follow no signal; any at which the other matrices have values will do.
         """
-        along = None if signals is None else signals[None]
+        along = self.along(t, inside, signals, 0)
         return np.asarray(self.system.coefficients.taylor(t, order, inside, along).E[order])
 
     def along(
@@ -274,8 +275,7 @@ def strangeness_free(
         if name in system.followed and structure.mu and (inputs is None or not inputs.known[j]):
             raise ConfigError(_unknown(system, name, "the equations contain it"))
     found = whole.equations(t, inside, signals).hidden
-    if found is None:
-        return whole
+    assert found is not None  # noqa: S101  there is a structure
     if structure.mu and signals is not None:
         _refuse_slopes(whole, found, t, inside, signals)
     m, orders = system.m, np.arange(structure.mu + 1)
@@ -287,8 +287,7 @@ def strangeness_free(
         if inputs is None or not inputs.known[j]:
             # M is a projector: its rows, weighted by the column of the derivative, are that.
             weight = driving[:, m * k + j]
-            of = [x for x, w in zip(system.states, weight, strict=True)
-                  if w > _ABSENT * weight.max()]
+            of = [*compress(system.states, weight > _ABSENT * weight.max())]
             raise ConfigError(_unknown(
                 system, system.inputs[j],
                 f"a hidden constraint on {listed(of)} contains its derivative of order {k}",

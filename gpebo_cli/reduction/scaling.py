@@ -73,9 +73,8 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     over all entries that are not zero, |·| being the largest over time: multiplying an equation, a
     state or the time by a number changes its factor alone. Terms of E count ``mass`` times.
     """
-    n = c.E.shape[2]
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    return _scaling(_factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0], n)
+    return _scaling(_factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0])
 
 
 def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n: int) -> Scaling:
@@ -87,12 +86,13 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
         factors = terms.nearest(np.ones(len(logs)), logs)
         rest = terms.counting(factors, logs)
         if rest.all():
-            return _scaling(factors, n)
+            return _scaling(factors)
         some[some] = rest
 
 
-def _scaling(factors: Array, n: int) -> Scaling:
+def _scaling(factors: Array) -> Scaling:
     """From the logarithms of the factors (2 n + 1,)."""
+    n = len(factors) // 2
     r = factors[:n]
     # A factor of all rows is left open, and means nothing.
     weights = 10.0 ** np.rint((r - r[:1]) / np.log(10.0))
@@ -157,23 +157,15 @@ class _Terms(NamedTuple):
     rows: IntArray  # (e,) of each entry
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
-    shape: tuple[int, int]  # (a, b + 1): how many factors rows have, and columns and the time
-    each: Array | None = None  # (a + b + 1, e) all of it, where there are few
+    total: int  # a + b + 1: how many factors there are
 
     @classmethod
     def at(cls, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, ...]) -> _Terms:
         """For entries (e,) of rows i and columns j of a matrix of this shape, with τ^order each."""
-        return cls(i, shape[0] + j, order.astype(np.float64), (shape[0], shape[1] + 1))
-
-    @property
-    def total(self) -> int:
-        """How many factors there are."""
-        return sum(self.shape)
+        return cls(i, shape[0] + j, order.astype(np.float64), sum(shape) + 1)
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
-        if self.each is not None:
-            return factors @ self.each
         found: Array = factors[self.rows] + factors[self.columns] + self.of_time * factors[-1]
         return found
 
@@ -202,30 +194,20 @@ class _Terms(NamedTuple):
         Squares count so often (e,). Singular values of a thousand states would take longer than a
         run.
         """
-        if self.each is not None:
-            counted = self.each * counts
-            whole = counted @ self.each.T
-            whole.flat[:: self.total + 1] += _OPEN
-            return np.asarray(-np.linalg.solve(whole, counted @ logs), dtype=np.float64)
-        n, (a, b), right = self.total, self.shape, -self.transposed(logs * counts)
+        n, right = self.total, -self.transposed(logs * counts)
         with_time, own = (self.transposed(x * counts) for x in (self.of_time, 1.0))
         own[-1] = with_time[-1]
         own += _OPEN
-        if n <= _FULL:  # rows, each beside columns and the time only, are eliminated
-            beside = np.bincount(self.rows * b + self.columns - a, counts, a * b).reshape(a, b)
-            beside[:, -1] = with_time[:a]
-            left = np.diag(own[a:])
-            left[-1, :-1] = left[:-1, -1] = with_time[a:-1]
-            share = beside / own[:a, None]
-            others = np.linalg.solve(left - beside.T @ share, right[a:] - right[:a] @ share)
-            return np.concatenate([right[:a] / own[:a] - share @ others, others])
-        from scipy.sparse import csc_array
-        from scipy.sparse.linalg import splu
-
         every, last, with_time[-1] = np.arange(n), np.full(n, n - 1), 0.0
         values = np.concatenate([counts, counts, own, with_time, with_time])
         down = np.concatenate([self.rows, self.columns, every, every, last])
         across = np.concatenate([self.columns, self.rows, every, last, every])
+        if n <= _FULL:
+            whole = np.bincount(down * n + across, values, n * n).reshape(n, n)
+            return np.asarray(np.linalg.solve(whole, right), dtype=np.float64)
+        from scipy.sparse import csc_array
+        from scipy.sparse.linalg import splu
+
         return np.asarray(splu(csc_array((values, (down, across)), shape=(n, n))).solve(right))
 
 
@@ -242,7 +224,7 @@ def _balancing(
         return terms, partial(terms.nearest, counts)
     each = np.array([terms @ factor for factor in np.eye(terms.total)])
     inverse = np.linalg.pinv((each * counts) @ each.T, rcond=_SINGULAR, hermitian=True)
-    return terms._replace(each=each), partial(np.matmul, -inverse @ (each * counts))
+    return terms, partial(np.matmul, -inverse @ (each * counts))
 
 
 def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:

@@ -76,10 +76,9 @@ def strangeness_free_form(
     zero, direct = system.coefficients.zero, direct_part(c, system.coefficients.zero)
     F, theta = c.F, c.theta
     if "phi" not in zero:  # one more unknown, whose value is known to be 1
-        one = np.zeros((*theta.shape[:2], 1))
-        one[0] = 1.0
         F = np.concatenate([F, c.phi[..., None]], axis=3)
-        theta = np.concatenate([theta, one], axis=2)
+        theta = np.pad(theta, ((0, 0), (0, 0), (0, 1)))
+        theta[0, :, -1] = 1.0
     count = slice(0, 1) if structure.time_invariant else slice(None)
     E, A = c.E[:, count], c.A[:, count]
     model = (scaling.rows, scaling.columns, scaling.time, mu + 1)

@@ -130,8 +130,8 @@ def _analysed(
     for mu in range(max_mu + 1):
         if mu:
             c = system.coefficients.taylor(t, mu)
-        _refuse_overflow(system, c, scaling, mu)
-        levels = _judged(t, c, mu, scaling, rank_tol, invariant)
+        _refuse_overflow(system, c, scaling)
+        levels = _judged(t, c, scaling, rank_tol)
         if levels.reference is None:
             reason = levels.failure
             continue
@@ -141,7 +141,7 @@ def _analysed(
                 return staged
             # The right μ is followed by others that find the same number of constraints.
             more = system.coefficients.taylor(t, mu + 1)
-            if _judged(t, more, mu + 1, scaling, rank_tol, invariant).a != levels.a:
+            if _judged(t, more, scaling, rank_tol).a != levels.a:
                 raise unclear_ranks(system, t, UnclearError(0, rounding=True))
         found = Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
@@ -173,7 +173,7 @@ def _refuse_limit(
     constraints = -1
     for mu in range(max_mu + 1, min(system.n + 1, 20, _LOOKED_AHEAD // system.n) + 1):
         c = system.coefficients.taylor(t, mu)
-        levels = _judged(t, c, mu, scaling, rank_tol, invariant=True)
+        levels = _judged(t, c, scaling, rank_tol)
         if levels.reference is None:
             continue
         if levels.a == constraints:  # two in a row: rounding does not find the same ones
@@ -252,10 +252,9 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
     there, n = slice(middle, middle + 1), len(of.rows)
     E, A = (x if x.shape[1] == 1 else x[:, there] for x in (c.E, c.A))
     e, aa = scaled(E, A, of.rows, of.columns, of.time, len(E))
-    beside = np.zeros((3, n, 2 * n))
-    beside[:2, :, :n], beside[2, :, :n] = e[0, 0], e[0, 0].T
-    beside[1, :, n:], beside[2, :, n:] = aa[0, 0], aa[0, 0].T
-    spread = np.linalg.svd(beside, compute_uv=False).tolist()
+    now = e[0, 0], aa[0, 0]
+    beside = now[0], np.hstack(now), np.vstack(now)
+    spread = [np.linalg.svd(x, compute_uv=False).tolist() for x in beside]
     if not any(rank_tol * s[0] < value < _APART * s[0] for s in spread for value in s):
         return False
     try:
@@ -277,12 +276,10 @@ def unclear_ranks(system: DescriptorSystem, t: Array, unclear: UnclearError) -> 
     return ModelError(f"{who(system)}: {why}")
 
 
-def _refuse_overflow(
-    system: DescriptorSystem, c: Coefficients, scaling: Scaling, mu: int
-) -> None:
+def _refuse_overflow(system: DescriptorSystem, c: Coefficients, scaling: Scaling) -> None:
     """LAPACK's singular values of what is not finite may take for ever."""
     with np.errstate(all="ignore"):
-        weight = scaling.rows[:, None] * scaling.columns * scaling.time**mu
+        weight = scaling.rows[:, None] * scaling.columns * scaling.time ** (len(c.E) - 1)
         finite = all(np.isfinite(distinct(x) * weight).all() for x in (c.E, c.A))
     if not finite:
         raise ModelError(
@@ -316,12 +313,10 @@ def _probe_times(system: DescriptorSystem, start: float, stop: float) -> Array:
     return np.union1d(t, middles)
 
 
-def _judged(
-    t: Array, c: Coefficients, mu: int, scaling: Scaling, rank_tol: float, invariant: bool
-) -> _Levels:
+def _judged(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float) -> _Levels:
     """Levels at all times, or at one that says why this μ will not do."""
-    model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
-    middle, n = len(t) // 2, c.E.shape[2]
+    model = (c.E, c.A, scaling.rows, scaling.columns, scaling.time, len(c.E))
+    middle, n, height = len(t) // 2, c.E.shape[2], len(c.E) * c.E.shape[2]
     at = t[middle : middle + 1]
     # A μ that will not do fails at one time already.
     a, smallest, rows, columns, Z1 = kernels.structure.reference(*model, middle, rank_tol)
@@ -331,10 +326,10 @@ def _judged(
     )
     if failure:
         return _Levels(a, smallest, failure)
-    reference = Pivots(rows, columns, (mu + 1) * n - a, Z1)
+    reference = Pivots(rows, columns, height - a, Z1)
     bounds, left, dynamics = kernels.structure.bounds(*model, *reference)
     finite: Array | None = dynamics if np.isfinite(dynamics).all() else None
-    if invariant:
+    if len(t) == 1:
         return _Levels(a, smallest, "", reference, float(smallest.min()), finite)
     # Away from rank changes bounds serve as well as singular values, and the elimination that
     # the reduction does anyway gives them for a fraction of the price. Singular values are computed
@@ -348,8 +343,8 @@ def _judged(
     counts, exact = kernels.structure.levels(E, A, *model[2:], rank_tol, -1)
     if (counts != a).any():
         times, k = t[which], int(np.argmax(counts != counts[0]))
-        first, then = ((mu + 1) * n - int(counts[i]) for i in (0, k))
-        lost = min((mu + 1) * n - min(first, then) - 1, n)  # constraints, were it not zero
+        first, then = (height - int(counts[i]) for i in (0, k))
+        lost = min(height - min(first, then) - 1, n)  # constraints, were it not zero
         value = kernels.structure.levels(E, A, *model[2:], rank_tol, lost)[1][:, 0]
         return _Levels(a, bounds, (
             f"the rank of the derivative array changes from {first} at t = {times[0]:.6g} to "

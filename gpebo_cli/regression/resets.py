@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import reciprocals
 
 _SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
 _SYMMETRIC = 1e-8  # below this share of Ω, what is not symmetric is rounding
@@ -64,10 +65,8 @@ class ExtensionState:
         symmetric = bool(np.abs(omega - omega.T).max() <= _SYMMETRIC * np.abs(omega).max())
         u, size, vt = np.linalg.svd(0.5 * (omega + omega.T) if symmetric else omega)
         root = np.sqrt(size)
-        rhs = np.divide(
-            u.T @ rhs, root, out=np.zeros_like(root),
-            where=size > max(_SINGULAR * size[0], np.finfo(float).tiny),
-        )  # of L η
+        known = size > max(_SINGULAR * size[0], np.finfo(float).tiny)
+        rhs = u.T @ rhs * reciprocals(root, known)  # of L η
         U, sigma, Vt = np.linalg.svd(transform)
         inverse = Vt.T / np.maximum(sigma, _SINGULAR * sigma[0])  # T⁻¹ = inverse Uᵀ
         left, right = root[:, None] * (u.T @ inverse), root[:, None] * (vt @ inverse)

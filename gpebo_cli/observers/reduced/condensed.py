@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from math import prod
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.linalg import transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, unresolved
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import AffineStateMap, InitialError, Measurements, Observation
@@ -69,9 +68,7 @@ def lean(
         t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
         full = regression.Y(t, t_in) + added.values[at, 0, :r, 0]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
-        factor = np.asarray(
-            np.linalg.qr(np.concatenate([factor, own.reshape(-1, p + 1)]), mode="r")
-        )
+        factor = triangular([np.concatenate([factor, own.reshape(-1, p + 1)])])
         count += len(at)
         if rows:
             at_rows += [
@@ -129,36 +126,26 @@ def beyond(
     """
     fine = edges(signals.mesh.edges, mesh.edges)
     cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
-    first, zeta = 0, np.zeros((len(size), 1))
+    first, zeta, samples = 0, np.zeros((len(size), 1)), signals.mesh.edges
     errors = _interpolated(errors, mesh, solver.tol)
+
+    def difference(t: Array, inside: Array) -> Array:
+        """[u; y] beyond the thinned ones at the times t (N,), (N, m + r, 1)."""
+        return (signals.at(t, inside) - few.at(t, inside))[:, :, None]
+
     while first < mesh.size:
         last = max(first + 1, int(np.searchsorted(cuts, cuts[first] + _AT_ONCE, side="right")) - 1)
         window = Mesh(fine[cuts[first] : cuts[last] + 1], signals.mesh.rule)
-        seen, part = _part(signals, window), slice(first, last)
+        part, own = slice(first, last), slice(*samples.searchsorted(window.edges[[0, -1]]))
         added, zeta, error = driven(
-            errors, partial(_beyond, seen, few), window, zeta, tol=solver.tol,
-            max_elements=solver.max_elements, floor=size,
+            errors, difference, window, zeta, tol=solver.tol, max_elements=solver.max_elements,
+            floor=size,
         )
         points, near = mesh.points[part], _INSIDE * added.mesh.steps.min()
         inside = points.clip(points[:, :1] + near, points[:, -1:] - near)  # of a short element
         at_points = added(points.ravel(), inside.ravel()).reshape(*points.shape, -1)
-        yield part, added, at_points, seen.mesh.edges, error
+        yield part, added, at_points, samples[own], error
         first = last
-
-
-def _beyond(signals: Trajectory, few: Measurements, t: Array, inside: Array) -> Array:
-    """[u; y] beyond the thinned ones at the times t (N,), (N, m + r, 1)."""
-    return (signals(t, inside) - few.at(t, inside))[:, :, None]
-
-
-def _part(signals: Measurements, window: Mesh) -> Trajectory:
-    """[u; y] (m + r,) in a window."""
-    whole = signals.mesh
-    first = int(np.searchsorted(whole.edges, window.edges[0] + 0.5 * window.steps[0])) - 1
-    last = int(np.searchsorted(whole.edges, window.edges[-1] - 0.5 * window.steps[-1]))
-    part = slice(first, last)
-    values = np.concatenate([signals.inputs.values[part], signals.outputs.values[part]], axis=2)
-    return Trajectory(Mesh(whole.edges[first : last + 1], whole.rule), values)
 
 
 def _interpolated(errors: ErrorsAt, mesh: Mesh, tol: float) -> ErrorsAt:

@@ -17,7 +17,7 @@ from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import Kind, Mesh, Samples, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import largest_entry, log_norm
+from gpebo_cli.observers._base import log_norm
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, ObserverMatrices, weakest
 from gpebo_cli.observers.reduced.regression import (
     OVER_TIME,
@@ -28,7 +28,7 @@ from gpebo_cli.observers.reduced.regression import (
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, units_along
-from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem, measured
+from gpebo_cli.observers.reduced.system import AT_ONCE, SMALL, ReducedSystem
 from gpebo_cli.simulation import ivp
 
 _LARGEST = 1e60  # entry of the dynamic extension: squares of squares are still numbers
@@ -42,7 +42,6 @@ class Extension:
     error_estimate: float  # relative to each signal's own size, the largest
     assembled: Assembled
     scale: Array  # (K, p) size of the terms of each column of ψ so far, element by element
-    units: Array  # (k,) of the coordinates
     weakest: tuple[float, float]  # smallest singular value behind Assumption 1, and its time
     asked: Array | None = None  # (M,) times of the assembled offset and gain; None: all points
 
@@ -54,10 +53,9 @@ class Extension:
     @property
     def state_map(self) -> tuple[Trajectory, Trajectory]:
         """Offset (n,) and gain (n, p) of the state."""
-        found, mesh = self.assembled, self.mesh
-        if self.asked is None:
-            return mesh.trajectory(found.offset), mesh.trajectory(found.gain)
-        return mesh.sampled(self.asked, found.offset), mesh.sampled(self.asked, found.gain)
+        mesh, found = self.mesh, self.assembled
+        signal = mesh.trajectory if self.asked is None else partial(mesh.sampled, self.asked)
+        return signal(found.offset), signal(found.gain)
 
     def rows(self, kept: IntArray) -> tuple[Trajectory, Trajectory]:
         """Y (rows,) and ψ (rows, p) of the rows that are ``kept`` (rows,)."""
@@ -67,21 +65,20 @@ class Extension:
 
     def kept_at(self, t: Array) -> Extension:
         """The same with the state's offset and gain at the times t (M,) only."""
-        sampler = self.mesh.sampler(t)
-        offset, gain = (sampler(signal.values) for signal in self.state_map)
+        offset, gain = (signal(t) for signal in self.state_map)
         return replace(
             self, asked=t, assembled=replace(self.assembled, offset=offset, gain=gain)
         )
 
-    def growth(self, q: int) -> tuple[float, float]:
+    def growth(self, reduced: ReducedSystem) -> tuple[float, float]:
         """Largest entry of Φ in comparable units, in which its columns start at size 1.
 
         And ln ‖Φ(end)‖₂, which is 0 at the start.
         """
         values = self.trajectory.values
         some = np.stack([values[0, 0], self.assembled.largest, values[-1, -1]])
-        Phi = comparable(some[..., 1 + q :], self.units)
-        return largest_entry(Phi), log_norm(Phi[-1])
+        Phi = comparable(some[..., 1 + reduced.system.q :], reduced.units)
+        return float(np.abs(Phi).max(initial=0.0)), log_norm(Phi[-1])
 
 
 def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
@@ -91,9 +88,8 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     large = len(start) > SMALL and solver.name != "ivp"
 
     # What is integrated is in comparable units, as written where these are.
-    of_rows, of_columns = reduced.units, np.ones(columns)
-    of_columns[1 : 1 + q] = reduced.form.units.unknowns
-    of_columns[1 + q :] = units_along(start[:, 1 + q :], of_rows)
+    of_rows, of_unknowns = reduced.units, reduced.form.units.unknowns
+    of_columns = np.concatenate([[1.0], of_unknowns, units_along(start[:, 1 + q :], of_rows)])
     units = of_rows[:, None] / of_columns
     plain = bool((units == 1.0).all())
 
@@ -117,9 +113,9 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
     windows = [mesh] if large or solver.name == "ivp" else mesh.windows()
     if windows[0] is signals.mesh and reduced.injection is None and solver.name != "ivp":
-        u, y = _over_time(signals.inputs.values), _over_time(signals.outputs.values)
-        points, inside = _over_time(mesh.points), _over_time(mesh.inside)
-        known = equations(reduced.first, measured(reduced.form, points, inside, u, y))
+        both = np.concatenate([signals.inputs.values, signals.outputs.values], axis=2)
+        driving = reduced.form.driving(*map(_over_time, (mesh.points, mesh.inside, both)))
+        known = equations(reduced.first, driving)
     marched = series.solve_dense(problem, mesh, **limits, known=known) if large else None
     if marched is not None:
         return _assembled(reduced, units, marched, monitor.latest, as_found=True)
@@ -156,9 +152,7 @@ class _Monitor:
             ]
         z, *seen = map(_over_time, self._whole)
         equations = AlgebraicEquations(*seen)
-        self.latest = regression_signals(
-            z, self._reduced.system.q, self._reduced.basis, equations
-        )
+        self.latest = regression_signals(z, self._reduced.basis, equations)
         if (self.latest.largest / self.units).max(initial=0.0) > _LARGEST:
             raise SolverError(
                 f"the dynamic extension of plant {self._reduced.system.name} grows beyond "
@@ -239,7 +233,7 @@ def joined(parts: Iterable[Extension]) -> Extension:
             found, **over_time, Y_scale=max(of_Y), column_scale=np.max(of_columns, axis=0),
             largest=np.max(largest, axis=0), moving=np.max(moving, axis=0),
         ),
-        np.maximum.accumulate(scale, axis=0, out=scale), part.units, min(weak), asked,
+        np.maximum.accumulate(scale, axis=0, out=scale), min(weak), asked,
     )
 
 
@@ -264,7 +258,7 @@ def _assembled(
             _over_time(e if e.shape[:2] == (1, 1) else e[part, places])
             for e in (values, *solution.extras)
         )
-        of_gain, sizes = term_sizes(z, system.q, reduced.basis, AlgebraicEquations(*seen))
+        of_gain, sizes = term_sizes(z, reduced.basis, AlgebraicEquations(*seen))
         elements = len(sizes) // 3
         scale.append(sizes.reshape(elements, 3, sizes.shape[1]).max(axis=1))
         if not as_found:
@@ -277,8 +271,7 @@ def _assembled(
     error, rounding = solution.error_estimate, reduced.first.rounding
     if rounding is not None:
         error = max(error, found.lost(EPS * rounding))
-    trajectory = Trajectory(mesh, values)
-    return Extension(trajectory, error, found, sizes, reduced.units, (smallest, at))
+    return Extension(Trajectory(mesh, values), error, found, sizes, (smallest, at))
 
 
 def _over_time(signal: Array) -> Array:

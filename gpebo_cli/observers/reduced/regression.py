@@ -133,16 +133,14 @@ def largest_at(signals: Iterable[Array]) -> IntArray:
     return np.unique(np.concatenate([np.abs(v).max(axis=1).argmax(axis=0) for v in signals]))
 
 
-def regression_signals(
-    z: Array, q: int, basis: Array, equations: AlgebraicEquations
-) -> Assembled:
+def regression_signals(z: Array, basis: Array, equations: AlgebraicEquations) -> Assembled:
     """All rows of Y and ψ, and the state's offset and gain, at N times.
 
     From z = [ξ_a | ξ_b | Φ] (N, k, 1 + q + n_a) in the coordinates of the basis B (n, k).
     """
     algebraic, g_y, G, Q1, H, _ = equations
     Y, psi, offset, gain, sizes = kernels.observer.regression_signals(
-        z, q, basis, algebraic, g_y, G, Q1, H
+        z, G.shape[2], basis, algebraic, g_y, G, Q1, H
     )
     if basis.shape[0] == basis.shape[1]:  # the kernel of E turns: products with w cancel, too
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
@@ -170,7 +168,7 @@ def resolve(found: Assembled, some: slice, terms: Array, form: EquationForm) -> 
 
 
 def term_sizes(
-    z: Array, q: int, basis: Array, equations: AlgebraicEquations
+    z: Array, basis: Array, equations: AlgebraicEquations
 ) -> tuple[Callable[[], Array], Array]:
     """Sizes of the terms of the gain (N, n, p), and of those of each column of ψ (N, p).
 
@@ -179,7 +177,7 @@ def term_sizes(
     """
     z, inward = np.abs(z[:, :, 1:]), transpose(equations.range)
     seen = np.abs(equations.on_basis) @ z
-    seen[:, :, :q] += np.abs(equations.G)
+    seen[:, :, : equations.G.shape[2]] += np.abs(equations.G)
 
     def of_gain() -> Array:
         through = np.abs(equations.elimination) @ (np.abs(inward) @ seen)

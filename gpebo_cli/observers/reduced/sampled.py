@@ -24,13 +24,7 @@ from gpebo_cli.numerics.collocation import LinearSolution, solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers._base import (
-    ByName,
-    InitialError,
-    SampledBlock,
-    largest_entry,
-    log_norm,
-)
+from gpebo_cli.observers._base import ByName, InitialError, SampledBlock, log_norm
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices, observer_matrices
 from gpebo_cli.observers.reduced.regression import (
     VANISHING,
@@ -39,13 +33,7 @@ from gpebo_cli.observers.reduced.regression import (
     term_sizes,
 )
 from gpebo_cli.observers.reduced.split import comparable, split_in_frame
-from gpebo_cli.observers.reduced.system import (
-    Formulation,
-    begin_at,
-    choose_form,
-    measured,
-    start_at,
-)
+from gpebo_cli.observers.reduced.system import Formulation, begin_at, choose_form, start_at
 from gpebo_cli.recordings.hold import Hold, each_of, edges, held, of_outputs
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
@@ -145,18 +133,15 @@ class SampledObserver(Formulation):
         self, t: Array, inside: Array, signals: Array
     ) -> tuple[ObserverMatrices, Array]:
         """The matrices at the times t (N,), and [v; y] (N, · + r, 1) from [u; y] (N, m + r)."""
-        o = observer_matrices(
-            self.form, t, inside, self.solver.rank_tol, self.first,
-            signals=signals if self.system.followed else None,
-        )
+        rank_tol = self.solver.rank_tol
+        o = observer_matrices(self.form, t, inside, rank_tol, self.first, signals=signals)
         rank = self.first.split.rank
         if o.split.rank != rank:
             raise ModelError(
                 f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
                 f"before t = {t[-1]:.6g}; the observer needs it constant"
             )
-        m = self.system.m
-        return o, measured(self.form, t, inside, signals[:, :m], signals[:, m:])
+        return o, self.form.driving(t, inside, signals)
 
     def _block(
         self, z: Array, t: Array, signals: Array, before: SampledState | None, step: Array | None,
@@ -166,11 +151,11 @@ class SampledObserver(Formulation):
         system, basis = self.system, self.basis
         o, driving = self._matrices(t, t, signals)
         equations = o.equations(driving)
-        assembled = regression_signals(z, system.q, basis, equations)
+        assembled = regression_signals(z, basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
-        growth = largest_entry(Phi[1:])
+        growth = float(np.abs(Phi[1:]).max(initial=0.0))
         smallest = float(o.injectivity.min())
-        of_gain, scale = term_sizes(z, system.q, basis, equations)
+        of_gain, scale = term_sizes(z, basis, equations)
         if basis.shape[1] > o.split.rank:
             # What the kernel of E, which turns, leaves of z holds but for errors of z's own size.
             own = (np.abs(z[:, :, 1:]) / self.units[:, None]).max(axis=1, initial=0.0)[:, None]
@@ -219,8 +204,7 @@ def sampled_observer(
         eye = np.eye(system.n)
         split = replace(first.split, basis=eye, dual=eye, frame=None)
         first = replace(first, split=split, on_basis=first.algebraic)
-    u, y = np.split(sample[None], [system.m], axis=1)
-    begin = start_at(used, first, measured(used, t, t, u, y))
+    begin = start_at(used, first, used.driving(t, t, sample[None]))
     xi = begin_at(xi_a0, used, first, begin)
     return SampledObserver(used, solver, first, begin, xi, regression, note, hold)
 
@@ -235,6 +219,6 @@ def _kernel_is_fixed(
     frame = first.split.frame
     if frame is None:
         return False
-    signals = np.repeat(sample[None], len(t), axis=0) if form.system.followed else None
+    signals = np.repeat(sample[None], len(t), axis=0)
     E = form.mass(t, t, signals) / form.units.equations[:, None]
     return split_in_frame(E, frame, form.units.states, rank_tol) is not None

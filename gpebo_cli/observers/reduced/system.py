@@ -153,8 +153,7 @@ class ReducedSystem(Formulation):
 
     def measured(self, t: Array, inside: Array) -> Array:
         """[v; y] (N, v + r, 1) at the times t (N,)."""
-        u, y = self.signals.inputs(t, inside), self.signals.outputs(t, inside)
-        return measured(self.form, t, inside, u, y)
+        return self.form.driving(t, inside, self.signals.at(t, inside))
 
     def start_at(self, time: float, inside: float) -> Start:
         """The start of an extension that begins at a later time."""
@@ -163,9 +162,8 @@ class ReducedSystem(Formulation):
 
     def assumptions(self, weakest: tuple[float, float]) -> tuple[Assumption, ...]:
         """Rank of E and Assumption 1: the ``weakest`` singular value, and its time."""
-        frame = self.first.split.frame
-        left = None if frame is None else frame.remaining
-        rank = self.first.split.rank + (0 if left is None else left.given_up.shape[1])
+        split = self.first.split
+        rank = split.rank if split.frame is None else split.frame.domain.shape[1]
         of = "smallest_singular_value" + ("" if self.lost is None else "_of_the_rest")
         evidence = dict(zip((of, "at"), weakest, strict=True))
         return self.needed(rank, evidence, holds=self.lost is None)
@@ -203,8 +201,8 @@ def reduced_system(
             signals=at, frame=frame,
         )
         note = f"; {_reason(error)}: what it touches is not estimated"
-    u, y = signals.inputs.values[0, :1], signals.outputs.values[0, :1]
-    begin = start_at(used, first, measured(used, t[:1], inside[:1], u, y))
+    now = np.concatenate([part.values[0, :1] for part in (signals.inputs, signals.outputs)], axis=1)
+    begin = start_at(used, first, used.driving(t[:1], inside[:1], now))
     start = begin_at(xi_a0, used, first, begin)
     if unknown is not None:
         begin, start = with_unknown(begin, start, unknown, xi_a0, system)
@@ -270,11 +268,6 @@ def choose_form(
 def _reason(error: NotObservableError) -> str:
     """What fails and where; the name of the plant and advice are left out."""
     return str(error).rpartition("; ")[0].partition(": ")[2]
-
-
-def measured(form: EquationForm, t: Array, inside: Array, u: Array, y: Array) -> Array:
-    """[v; y] (N, v + r, 1) from u (N, m) and y (N, r) at the times t (N,), v as the form has it."""
-    return np.concatenate([form.driving(t, inside, u), y], axis=1)[:, :, None]
 
 
 def start_at(form: EquationForm, o: ObserverMatrices, signals: Array) -> Start:

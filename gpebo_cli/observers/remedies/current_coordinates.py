@@ -83,7 +83,7 @@ class CurrentCoordinates:
             signals = reduced.measured(t, inside)
             rows = arrays.joined(o.from_unknowns, o.dynamics, o.from_signals @ signals, axis=2)
             z = np.broadcast_to(identity, (len(t), *identity.shape))
-            a = regression_signals(z, q, basis, o.equations(signals))
+            a = regression_signals(z, basis, o.equations(signals))
             a = replace(a, Y=-a.Y, psi=-a.psi)  # as measurements of ζ: ψ = [R G, R𝒜V]
             if rotates:
                 # Further rows 0 = Q w, of the size of ψ; those of the outputs remain the last ones.
@@ -111,7 +111,7 @@ class CurrentCoordinates:
                 past = times[:, largest_at(v for v, _ in seen)]
                 yield Extension(
                     mesh.trajectory(rows[front:]), error, a.after(front),
-                    np.broadcast_to(a.column_scale, (mesh.size, p)), reduced.units, smallest,
+                    np.broadcast_to(a.column_scale, (mesh.size, p)), smallest,
                 )
 
         found = joined(kept_of(parts(), reduced.mesh, reduced.signals.asked))

@@ -115,12 +115,9 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         inside, A_0 = dual @ o.split.projector @ basis * units, o.dynamics * units / units[:, None]
         size = _LEAST * np.einsum("nij,nij->n", A_0, A_0)[:, None, None]
         Q = _SHARE * inside @ (A_0 @ transpose(A_0) + size * np.eye(n)) @ transpose(inside)
-        V = np.broadcast_to(weight * np.eye(rows), (len(t), rows, rows))
         return StateSpace(
-            A=np.broadcast_to(o.dynamics, (len(t), n, n)), b=np.zeros((len(t), n, 0)),
-            c=np.broadcast_to(c, (len(t), rows, n)), z=np.zeros((len(t), rows, 0)),
-            Q=np.broadcast_to(Q, (len(t), n, n)),
-            N=np.zeros((len(t), n, rows)), V=V,
+            A=o.dynamics, b=np.zeros((1, n, 0)), c=c, z=np.zeros((1, rows, 0)), Q=Q,
+            N=np.zeros((1, n, rows)), V=weight * np.eye(rows)[None],
         ), ()
 
     parts = filter_windows(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.observers._base import AffineStateMap, InitialError, Observation, Truth
+from gpebo_cli.model.descriptor import Array
+from gpebo_cli.observers._base import AffineStateMap, InitialError, Observation
 from gpebo_cli.observers.reduced.extension import Extension, extend
 from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.errors import respond
@@ -24,20 +26,17 @@ class Plain:
         if reduced.lost is not None:
             for signal in (extension.assembled.offset, extension.assembled.gain):
                 signal[:, reduced.lost] = np.nan
-        truth = InitialError(
-            reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual,
-            extension.trajectory, reduced.units,
-        )
-        return observation(reduced, extension, *extension.growth(reduced.system.q), truth)
+        return observation(reduced, extension, *extension.growth(reduced))
 
 
 def observation(
-    reduced: ReducedSystem, extension: Extension, growth: float, logarithm: float, truth: Truth,
-    resets: tuple[Reset, ...] = (),
+    reduced: ReducedSystem, extension: Extension, growth: float, logarithm: float,
+    resets: Sequence[Reset] = (), later: Sequence[tuple[float, Array, Array]] = (),
 ) -> Observation:
     """What an extension gives, perhaps of several segments with resets between them.
 
-    ``growth`` is the largest entry of Φ, and ``logarithm`` that of ‖Φ‖ over the horizon, ().
+    ``growth`` is the largest entry of Φ, and ``logarithm`` that of ‖Φ‖ over the horizon, ();
+    ``later`` starts are as of :class:`InitialError`.
     """
     system, noise, (start, stop) = reduced.system, reduced.signals.noise, reduced.signals.span
     kept = extension.assembled.kept_rows(system, reduced.regression)
@@ -51,10 +50,13 @@ def observation(
     return Observation(
         regression=LinearRegression(
             *extension.rows(kept), parameters=reduced.parameters, scale=extension.scale,
-            resets=resets, units=reduced.parameter_units,
+            resets=tuple(resets), units=reduced.parameter_units,
         ),
         state_map=AffineStateMap(*extension.state_map, reduced.form.units.states),
-        truth=truth,
+        truth=InitialError(
+            reduced.begin.dual, reduced.xi_a0, reduced.first.split.dual, extension.trajectory,
+            reduced.units, tuple(later),
+        ),
         error_estimate=extension.error_estimate,
         assumptions=reduced.assumptions(extension.weakest),
         growth=growth,

@@ -27,7 +27,7 @@ from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
-from gpebo_cli.observers._base import InitialError, Observation, log_norm
+from gpebo_cli.observers._base import Observation, log_norm
 from gpebo_cli.observers.reduced.extension import Extension, extend, joined
 from gpebo_cli.observers.reduced.split import comparable, units_along
 from gpebo_cli.observers.reduced.system import ReducedSystem, Start
@@ -85,13 +85,8 @@ class Resets:
             known = known.after(resets[-1])
             later.append((time, begin.dual, begin.dual @ xi_a))
         segments = joined(extensions)
-        growth, logarithms = zip(*(e.growth(reduced.system.q) for e in extensions), strict=True)
-        at_start = reduced.begin.dual
-        truth = InitialError(
-            at_start, at_start @ reduced.xi_a, dual, segments.trajectory, reduced.units,
-            tuple(later),
-        )
-        return observation(reduced, segments, max(growth), sum(logarithms), truth, tuple(resets))
+        growth, logarithms = zip(*(e.growth(reduced) for e in extensions), strict=True)
+        return observation(reduced, segments, max(growth), sum(logarithms), resets, later)
 
 
 def _restart(
