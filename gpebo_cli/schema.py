@@ -173,9 +173,9 @@ def _check_range(value: Any, field: Field[Any], where: str) -> None:
         low, high = field.metadata["range"]
         if not low <= value <= high:
             upto = f"to {high:g}" if math.isfinite(high) else "or more"
-            raise ConfigError(f"{where}: expected {low:g} {upto}, got {value:g}")
+            raise ConfigError(f"{where}: expected {low:g} {upto}, got {shown(value)}")
     if field.metadata.get("positive") and value <= 0:
-        raise ConfigError(f"{where}: expected a positive number, got {value:g}")
+        raise ConfigError(f"{where}: expected a positive number, got {shown(value)}")
 
 
 def convert(value: object, kind: Any, where: str) -> Any:
@@ -195,7 +195,7 @@ def convert(value: object, kind: Any, where: str) -> Any:
     elif origin is Literal:
         if isinstance(value, str | bool | int) and value in arguments:
             return value
-        hint = nearest(str(value), map(str, arguments))
+        hint = nearest(shown(value).strip("'"), map(str, arguments))
     elif is_dataclass(kind):
         return read(typing.cast("Any", kind), value, where)
     else:

@@ -180,7 +180,7 @@ WRONG = [
     (["run", "--cfg", "jb"], "--cfg needs one of job, hydra, all, got 'jb'"),
     (["run", "estimator=[gradient,drem]"], "for a run for each: -m estimator=gradient,drem"),
     (["run", "-m", "plant=[circuit, window]"], "for a run for each: -m plant=circuit,window"),
-    (["run", "noise=gaussian", "noise.seeds=1000000"], "expected 1 to 10000, got 1e+06"),
+    (["run", "noise=gaussian", "noise.seeds=1000000"], "expected 1 to 10000, got 1000000"),
     (["run", "noise=gaussian", "noise.seeds=10000"], "have 2e+07 samples; at most 2e+06 are"),
     (["run", "noise=gaussian", "noise.sample_time=1e-4"], "take some 7.68 GB of memory; a run"),
     (["run", "estimator.gamma=logspace(1,9,1e5)", "time.samples=100000", "output.max_rows=1e12"],

@@ -236,3 +236,12 @@ def test_of_calls_from_python(tmp_path):
     ):
         with refused(message, by=error):
             call()
+
+
+@pytest.mark.parametrize("settings", [
+    {"data": {"file": "x", "missing": 10**5000}}, {"observer": {"form": 10**5000}},
+    {"time": {"samples": 10**5000}}, {"time": {"samples": -10**400}}, {"gamma": 10**5000},
+])
+def test_of_whole_numbers_that_no_text_is_made_of(settings):
+    with pytest.raises(ConfigError, match=r"^[a-z_.]+: expected .*, got (a int that cannot|-1000)"):
+        run("circuit", estimator="drem", **settings)
