@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, overload
 import numpy as np
 
 from gpebo_cli import observers
-from gpebo_cli.api.choice import choose, folders
+from gpebo_cli.api.choice import Draft, choose, folders
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.files import is_file, shipped
@@ -30,7 +30,7 @@ from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Plant = str | os.PathLike[str] | Mapping[str, object] | DescriptorSystem
+Plant = str | os.PathLike[str] | Mapping[str, object] | Draft | DescriptorSystem
 Choice = str | Mapping[str, object]
 EstimatorChoice = Choice | Estimator
 Folder = str | os.PathLike[str]
@@ -62,7 +62,8 @@ def run(
 
     Args:
         plant: a name (``gpebo list plants``), the path of a YAML file, the content of one, or a
-            system from :func:`system_from_functions` or :func:`load_plant`.
+            system from :func:`system_from_functions` or :func:`load_plant`, or what
+            :func:`from_netlist` and the like make.
         regression: Y = ψη in place of a plant and an observer: a name, the path of a YAML file, or
             the content of one (docs/howto/regression.md).
         estimator: a name, a mapping with ``name`` and its settings, or an object of your own

@@ -51,7 +51,7 @@ class Operator:
         return out.reshape(x.values.shape)
 
     def most(self, elapsed: Array) -> Array | float:
-        """How many times as large its terms may be as the argument's were, so long after start."""
+        """How many times its argument its terms may be, ``elapsed`` (N,) s after the start."""
         if self.name == "integral":
             return elapsed
         return 2.0 * self.number if self.name == "hp" else 1.0

@@ -143,7 +143,7 @@ class TextRegression:
             name=f"regression {self.system.name}",
         )
         regression = LinearRegression(
-            mesh.trajectory(right), mesh.trajectory(psi), self.system.unknowns,
+            Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
             terms(mesh, columns)[:, -1, -p:], parametrisation=self.parametrisation,
         )
         return regression, error
