@@ -56,6 +56,15 @@ def simulated(plant, horizon=10.0):
     return run(plant, observer="none", time={"horizon": horizon})
 
 
+def test_what_is_read_is_run_as_it_is():
+    draft = from_netlist(PAPER, "test", measure="v(e1), i(L)")
+    found = run(draft, estimator="drem", time={"horizon": 2, "samples": 5})
+    expected = run(draft.mapping(), estimator="drem", time={"horizon": 2, "samples": 5})
+    for name in draft.states:
+        np.testing.assert_array_equal(found.estimates[name], expected.estimates[name])
+    assert load_plant(draft).states == tuple(draft.states)
+
+
 @given(order=st.permutations(PAPER.splitlines()[1:]))
 @settings(max_examples=5, deadline=None)
 @example(order=PAPER.splitlines()[1:])
