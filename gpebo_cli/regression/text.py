@@ -63,6 +63,7 @@ KEYS = (
 
 _FIRST_ELEMENTS = 16
 _MAX_DELAYED = 10_000  # edges that delays may ask for
+_AT_ONCE = 4096  # elements whose terms are looked at together
 _LOOKS = 3  # at where signals pass jumps
 _APART = 1e-13  # of a time: an edge nearer than that is there already
 _JUMPED = 1e-6  # of its size: what changes by more beside an end of an element jumps there
@@ -115,13 +116,18 @@ class TextRegression:
         p, noise = self.system.q, list[Array]()
 
         def terms(mesh: Mesh, columns: Array) -> Array:
-            t, nothing = mesh.points.ravel(), np.zeros(columns.shape[1] + p)
-            return self._terms(t, t - t[0], columns, nothing)[1].reshape(*mesh.points.shape, -1)
+            t, points = mesh.points.ravel(), mesh.points.shape[1]
+            so_far, found = np.zeros((1, columns.shape[1] + p)), list[Array]()
+            for first in range(0, len(t), _AT_ONCE * points):
+                part = slice(first, first + _AT_ONCE * points)
+                so_far, sizes = self._terms(t[part], t[part] - t[0], columns[part], so_far[-1])
+                found.append(sizes[points - 1 :: points])
+            return np.concatenate(found)
 
         def evaluated(mesh: Mesh) -> tuple[tuple[Array, Array, Array], list[Kind]]:
             columns, psi, right = self._on_mesh(signals, mesh)
             if not noise:  # what may cancel on a first mesh is not smaller on another one
-                noise.append(ROUNDING * EPS / tol * terms(mesh, columns[0])[-1, -1])
+                noise.append(ROUNDING * EPS / tol * terms(mesh, columns[0])[-1])
             if right is None:
                 assert Y is not None  # noqa: S101  a source gives it
                 right = Y(mesh.points.ravel(), mesh.inside.ravel())
@@ -144,7 +150,7 @@ class TextRegression:
         )
         regression = LinearRegression(
             Trajectory(mesh, right), Trajectory(mesh, psi), self.system.unknowns,
-            terms(mesh, columns)[:, -1, -p:], parametrisation=self.parametrisation,
+            terms(mesh, columns)[:, -p:], parametrisation=self.parametrisation,
         )
         return regression, error
 
