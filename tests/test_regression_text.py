@@ -264,7 +264,7 @@ def test_what_comes_later_changes_no_estimate_of_the_past(estimator):
 
 def test_terms_are_those_of_all_elements_piece_by_piece(monkeypatch):
     given = {"unknowns": {"a": 1.0, "b": 2.0}, "signals": {"u": "exp(-t)*sin(9*t)"},
-             "psi": [["hp(u, 3) + 1e-3", "integral(lp(u, 2))"]]}
+             "Y": ["u"], "psi": [["hp(u, 3) + 1e-3", "integral(lp(u, 2))"]]}
     whole = on_mesh(given)
     monkeypatch.setattr("gpebo_cli.regression.text._AT_ONCE", 3)
     pieces = on_mesh(given)
