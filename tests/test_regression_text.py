@@ -10,6 +10,8 @@ from processes import refused
 from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators, run
+from gpebo_cli.model.expressions import parse, record
+from gpebo_cli.model.expressions.syntax import signal
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
@@ -270,3 +272,30 @@ def test_terms_are_those_of_all_elements_piece_by_piece(monkeypatch):
     pieces = on_mesh(given)
     assert whole.mesh.size > 6
     np.testing.assert_array_equal(pieces.scale, whole.scale)
+
+
+def test_terms_of_an_expression_are_the_largest_that_it_adds_up():
+    u, w = signal("u", 0, "a signal"), signal("w", 1, "a signal")
+    tape = record([
+        parse(text, {"u": u, "w": w}, "x")
+        for text in ("u - w", "w - u + 1e-3", "-u*w", "(u - w)/(u + w)", "sin(u)", "2*u - u - u")
+    ])
+    t, values = np.array([0.0, 1.0]), np.array([[3.0, -1.0], [0.5, 0.25]])
+    found = tape.terms(t, values, 2.0 * np.abs(values))
+    np.testing.assert_allclose(found, [
+        [6.0, 6.0, 12.0, 3.0, np.sin(3.0), 12.0], [1.0, 1.0, 0.5, 1.0 / 0.75, np.sin(0.5), 2.0],
+    ])
+
+
+def test_sizes_so_far_are_handed_on_from_piece_to_piece():
+    """A signal that decays: later pieces alone would say that nothing was ever larger."""
+    text = regression_from_mapping({
+        "name": "x", "unknowns": {"a": 1.0, "b": 2.0}, "signals": {"u": None}, "Y": ["u"],
+        "psi": [["integral(u)*u", "lp(u, 2) + u"]],
+    })
+    t = 0.1 * np.arange(60)
+    u = np.exp(-3.0 * t)[:, None]
+    whole, state = text.advance("linear", None, t, u, u)[1], None
+    for part in (slice(0, 5), slice(5, 30), slice(30, 60)):
+        state, piece = text.advance("linear", state, t[part], u[part], u[part])
+        np.testing.assert_allclose(piece.scale, whole.scale[part], rtol=1e-12)
