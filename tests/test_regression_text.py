@@ -291,7 +291,7 @@ def test_sizes_so_far_are_handed_on_from_piece_to_piece():
     """A signal that decays: later pieces alone would say that nothing was ever larger."""
     text = regression_from_mapping({
         "name": "x", "unknowns": {"a": 1.0, "b": 2.0}, "signals": {"u": None}, "Y": ["u"],
-        "psi": [["integral(u)*u", "lp(u, 2) + u"]],
+        "psi": [["integral(exp(-3*t))", "exp(-3*t) + 0*u"]],
     })
     t = 0.1 * np.arange(60)
     u = np.exp(-3.0 * t)[:, None]
