@@ -17,7 +17,7 @@ from gpebo_cli.errors import ModelError
 from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.reduction.consistency import consistent_state
+from gpebo_cli.reduction.consistency import consistent_state, jumps
 from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
 from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
 from gpebo_cli.reduction.strangeness_free import (
@@ -65,36 +65,43 @@ def test_the_structure_of_a_text_is_found_once_for_a_horizon_and_a_tolerance():
 @given(SEEDS, st.integers(1, 4), st.integers(0, 4), st.sampled_from([0.0, 3.0, 8.0]))
 def test_a_consistent_state_is_returned_as_it_is(seed, nu, extra, scale):
     """The truth at the start satisfies the constraints to rounding, whatever the units."""
-    found, structure, form = case(seed, nu, extra, scale)
+    found, _, form = case(seed, nu, extra, scale)
     x0 = found.exact(ZERO)[0]
-    same = consistent_state(form, x0, structure.scaling.weights)
+    same = consistent_state(form, x0, lambda _: pytest.fail("nothing has to be solved"))
     assert same.tolist() == x0.tolist()
+
+
+def first_state(system, structure, form):
+    """The start of the collocation."""
+    step = jumps(system, structure, ZERO, ZERO, ZERO, form)
+    return consistent_state(form, system.initial_state, lambda x: step(0, x).after)
 
 
 def test_a_start_that_numbers_do_not_tell_is_none():
     found, structure, form = case(3, 2, 2)
     x0 = found.system.initial_state + np.arange(1.0, found.system.n + 1.0)
-    assert np.isfinite(consistent_state(form, x0, structure.scaling.weights)).all()
-    assert np.isnan(consistent_state(form, x0, np.inf * structure.scaling.weights)).all()
+    system = replace(found.system, initial_state=x0)
+    assert np.isfinite(first_state(system, structure, form)).all()
+    assert np.isnan(first_state(system, structure, replace(form, f2=np.inf * form.f2))).all()
 
 
 @settings(deadline=None, max_examples=40)
 @given(SEEDS, st.integers(1, 4), st.integers(0, 4), st.sampled_from([0, 1, 6]))
 def test_both_paths_start_from_the_same_state(seed, nu, extra, spread):
-    """By elimination and by singular vectors, with equations in any units."""
+    """By impulses and by what the adjoint equation conserves, with equations in any units."""
     found, structure, form = case(seed, nu, extra)
     rng = np.random.default_rng(seed)
     x0 = found.system.initial_state + rng.normal(size=found.system.n)
-    expected = consistent_state(form, x0, structure.scaling.weights)
-    rows = 10.0 ** rng.integers(-spread, spread + 1, found.system.n)
+    expected = first_state(replace(found.system, initial_state=x0), structure, form)
+    rows = 10.0 ** rng.uniform(-spread, spread, found.system.n)
     source = replace(found.system.coefficients, rows=rows)
     system = replace(found.system, coefficients=source, initial_state=x0)
     structure = analyse(system, 0.0, 5.0, max_mu=6, rank_tol=1e-10)
     form = strangeness_free_form(system, structure, ZERO, ZERO)
     size = np.abs(expected).max()
-    same = consistent_state(form, x0, structure.scaling.weights)
+    same = first_state(system, structure, form)
     np.testing.assert_allclose(same, expected, atol=1e-8 * size)
-    alone = consistent_start(system, structure, 0.0, 0.0)
+    alone = consistent_start(system, structure, ZERO, ZERO)
     np.testing.assert_allclose(alone, expected, atol=1e-8 * size)
     assert np.abs(form.A2[0] @ alone + form.f2[0]).max() < 1e-7 * size * np.abs(form.A2[0]).max()
 
@@ -170,24 +177,13 @@ def test_scalings_undo_units(seed, n, of_E):
         s = balance(c)
         assert all((np.log2(part) % 1 == 0).all() for part in (s.rows, s.columns, s.time))
         both = s.rows[:, None] * s.columns
-        return c.E * both / s.time, c.A * both, s.weights * rows
+        return c.E * both / s.time, c.A * both
 
     plain = scaled(np.ones(n), np.ones(n), 1.0)
     rows, columns = 2.0 ** rng.integers(-30, 30, n), 2.0 ** rng.integers(-30, 30, n)
     changed = scaled(rows, columns, 2.0 ** rng.integers(-30, 30))
-    for one, other in zip(plain[:2], changed[:2], strict=True):
+    for one, other in zip(plain, changed, strict=True):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
-
-
-@pytest.mark.parametrize("common", np.geomspace(1.0, 10.0, 7))
-def test_equations_within_a_decade_count_as_they_were_written(common):
-    """And one that is a thousand times as large counts a thousandth, whatever all are in."""
-    rows = common * np.array([1.0, 1.5, 0.6, 1e3])
-    E, A = rows[:, None] * np.eye(4), rows[:, None] * (np.ones((4, 4)) + np.eye(4))
-    none, empty = np.zeros((1, 1, 4, 0)), np.zeros((1, 1, 0))
-    c = Coefficients(E[None, None], A[None, None], none, none, none, empty, empty,
-                     np.zeros((1, 1, 4)), none, none)
-    np.testing.assert_allclose(balance(c).weights, [1.0, 1.0, 1.0, 1e-3])
 
 
 def test_no_piece_between_jumps_goes_unprobed():
@@ -211,15 +207,56 @@ def test_why_a_structure_cannot_be_told(E, A, message):
         analyse(plant, 0.0, 1.0, max_mu=2, rank_tol=1e-10)
 
 
+@pytest.mark.parametrize("solver", ["collocation", "ivp"])
+@pytest.mark.parametrize("row", [1.0, 4.0, 1e7])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_nearest_consistent_state_is_so_on_both_sides(sign):
-    """a' = l, b' = 3l − b, 0 = a + b: 3a − b is free of l, and (1, 0) is nearest to (1, −1)/2."""
+def test_a_start_keeps_what_no_impulse_moves(sign, row, solver):
+    """a' = l, b' = 3l − b, 0 = a + b: l moves a and b, 3a − b it does not, in any units."""
     plant = plant_from_mapping({
-        "name": "pair", "states": ["a", "b", "l"], "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]],
-        "A": [[0, 0, 1], [0, -1, 3], [1, 1, 0]], "initial_state": [sign, 0, 0],
+        "name": "pair", "states": ["a", "b", "l"], "E": [[row, 0, 0], [0, 1, 0], [0, 0, 0]],
+        "A": [[0, 0, row], [0, -1, 3], [1, 1, 0]], "initial_state": [sign, 0, 0],
     })
-    x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings()).initial_state
-    np.testing.assert_allclose(x0, [sign / 2, -sign / 2, -sign / 8], rtol=1e-12)
+    x0 = simulate(plant, TimeSettings(horizon=1.0), SolverSettings(name=solver)).initial_state
+    np.testing.assert_allclose(x0, [3 * sign / 4, -3 * sign / 4, -3 * sign / 16], rtol=1e-12)
+
+
+@settings(deadline=None, max_examples=15)
+@given(SEEDS, st.integers(1, 3))
+def test_a_run_from_the_state_before_a_jump_goes_on_as_the_run_that_jumps(seed, nu):
+    """In any units of equations, states and time, which the jump does not depend on either."""
+    rng = np.random.default_rng(seed)
+    n = nu + 2
+    E, A = np.diag([1.0] * (n - 1), 1), np.eye(n)
+    E[: n - nu, : n - nu], E[n - nu - 1, n - nu] = np.eye(n - nu), 0.0
+    A[: n - nu, : n - nu] = rng.normal(size=(n - nu, n - nu))
+    left, right = np.eye(n) + 0.3 * rng.normal(size=(2, n, n))
+    B = rng.normal(size=(n, 1))
+
+    def found(rows, columns, time, initial, start=0.0, level="step(t - {})"):
+        weight = rows[:, None] * columns
+        system = plant_from_mapping({
+            "name": "jumps", "states": [f"x{k}" for k in range(n)],
+            "inputs": {"u": level.format(repr(time))},
+            "E": (left @ E @ right * weight * time).tolist(),
+            "A": (left @ A @ right * weight).tolist(), "B": (rows[:, None] * B).tolist(),
+            "initial_state": (initial / columns).tolist(),
+        })
+        when = TimeSettings(start=start * time, horizon=(1.5 - start) * time)
+        return simulate(system, when, SolverSettings()), columns
+
+    ones = np.ones(n)
+    whole, _ = found(ones, ones, 1.0, np.zeros(n))
+    ((_, before, jump),) = whole.jumps
+    size = np.abs(jump.after).max()
+    again, _ = found(ones, ones, 1.0, before, start=1.0, level="1")
+    np.testing.assert_allclose(again.initial_state, jump.after, atol=1e-8 * size)
+    rows, columns = 10.0 ** rng.uniform(-6, 6, (2, n))
+    time = 10.0 ** rng.uniform(-6, 6)
+    other, _ = found(rows, columns, time, np.zeros(n))
+    ((_, _, same),) = other.jumps
+    np.testing.assert_allclose(same.after * columns, jump.after, atol=1e-7 * size)
+    turned = same.impulses * columns / time ** np.arange(1.0, len(same.impulses) + 1)[:, None]
+    np.testing.assert_allclose(turned, jump.impulses, atol=1e-7 * size)
 
 
 @settings(max_examples=8)

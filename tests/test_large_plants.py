@@ -600,16 +600,17 @@ def test_a_full_plant_that_nothing_drives():
     np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
 
 
-def test_a_full_plant_starts_from_the_nearest_state():
-    """‖M (v − v₀)‖ is least with J v = 0, and p follows from the derivative of that."""
+def test_a_full_plant_starts_from_what_constraints_leave_of_its_momenta():
+    """M (v − v₀) is a combination of rows of J, J v = 0, and p follows from the derivative."""
     rng = np.random.default_rng(4)
     M, K, J, b = blocks = saddle(48, 11, rng)
     x0, system = rng.normal(size=59), full_plant(*matrices(blocks), u="cos(3*t)")
     grown = large._Plant(replace(system, initial_state=x0), 7)
-    grown.eliminate(Mesh(np.array([0.0, 1.0]), radau_rule(4)))
-    x, _ = large._start(grown)
+    mesh = Mesh(np.array([0.0, 1.0]), radau_rule(4))
+    grown.eliminate(mesh)
+    x, _ = large._start(grown, mesh)
     free = null_space(J)
-    v = free @ np.linalg.lstsq(M @ free, M @ x0[:48], rcond=None)[0]
+    v = free @ np.linalg.solve(free.T @ M @ free, free.T @ M @ x0[:48])
     p = np.linalg.solve(J @ np.linalg.solve(M, J.T), J @ np.linalg.solve(M, K @ v - b))
     np.testing.assert_allclose(x[:48], v, atol=1e-10)
     np.testing.assert_allclose(x[48:], p, atol=1e-9 * np.abs(p).max())

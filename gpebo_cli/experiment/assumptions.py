@@ -193,7 +193,7 @@ def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assu
             },
         ),
         Assumption(
-            "Consistent start", "a consistent initial state exists near the one given", True,
+            "Consistent start", "a consistent initial state follows from the one given", True,
             {"largest_change": moved},
         ),
     ]

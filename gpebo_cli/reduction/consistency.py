@@ -1,8 +1,6 @@
 """Consistent values: at the start, and after a jump of the input.
 
-These are two different questions. At the start the user's x0 may break constraints, and the
-differential part of it is kept. At a jump the solution is already running and what happens to it
-is decided by the equation itself, in the sense of distributions.
+Both are one question: which state follows, in the sense of distributions, from the one just before?
 """
 
 from __future__ import annotations
@@ -14,6 +12,7 @@ from math import perm
 import numpy as np
 
 from gpebo_cli.errors import ModelError
+from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.reduction.strangeness_free import StrangenessFree, strangeness_free_form
 from gpebo_cli.reduction.structure import Structure
@@ -23,13 +22,14 @@ _ROUNDING = 16  # units in the last place of everything that a value is made of
 _IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
 
 
-def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
-    """The consistent x nearest to x0 in its differential part, shape (n,).
+def consistent_state(
+    form: StrangenessFree, x0: Array, step: Callable[[Array], Array]
+) -> Array:
+    """The state (n,) that follows at once from x0, at the first time of ``form``.
 
-    Minimises ‖W E (x − x0)‖ subject to A2 x + f2 = 0 at the first time of ``form``, where the
-    weights W (n,) make the rows of E comparable, see :class:`.scaling.Scaling`. Unique,
-    because E has full column rank on the kernel of A2; NaN where numbers are so large or so small
-    that it has not. A state that satisfies the constraints to rounding is returned as it is.
+    One that satisfies A2 x + f2 = 0 to rounding is returned as it is, and if some consistent state
+    has the same E x, that is the one. Otherwise ``step`` tells, see :func:`jumps`: NaN where
+    numbers are too large.
     """
     if not form.A2.shape[1]:
         return x0.copy()
@@ -40,15 +40,11 @@ def consistent_state(form: StrangenessFree, x0: Array, weights: Array) -> Array:
     terms = np.abs(T) @ (np.abs(E1) @ size) + np.abs(offset) + size
     if (np.abs(moved) <= _ROUNDING * _EPS * (through + terms)).all():
         return x0.copy()
-    if (np.abs(E @ moved) > _ROUNDING * _EPS * (np.abs(E) @ (through + terms))).any():
-        image = weights[:, None] * (E @ T)
-        norms = np.linalg.norm(image, axis=0)
-        if not (np.isfinite(norms) & (norms > 0.0)).all():
-            return np.full(len(x0), np.nan)
-        moved -= T @ (np.linalg.lstsq(image / norms, weights * (E @ moved), rcond=None)[0] / norms)
     x = x0 + moved
+    if (np.abs(E @ moved) > _ROUNDING * _EPS * (np.abs(E) @ (through + terms))).any():
+        x = step(x0)
     # What did not move keeps the digits it was given.
-    return np.where(np.abs(moved) <= 2 * _ROUNDING * _EPS * (terms + np.abs(x)), x0, x)
+    return np.where(np.abs(x - x0) <= 2 * _ROUNDING * _EPS * (terms + np.abs(x)), x0, x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +56,13 @@ class Jump:
 
 
 def jumps(
-    system: DescriptorSystem, structure: Structure, times: Array, widths: Array
+    system: DescriptorSystem, structure: Structure, times: Array, before: Array, after: Array,
+    form: StrangenessFree | None = None,
 ) -> Callable[[int, Array], Jump]:
     """The jump k at times[k] (N,), a function of k and of the state's limit from the left (n,).
 
-    ``widths`` (N,) tell how far beside the times the sides of a jump are looked at.
+    ``before`` and ``after`` (N,) tell on which sides of the times the model is looked at; at the
+    start both are after it. ``form`` are the equations at the times, where they are at hand.
 
     With x = x_regular + Σ_k w_{k+1} δ^(k) and a step w_0 = x(t+) − x(t−), the coefficient of
     δ^(j) in E x' = A x + f (f jumps but has no impulse) gives, j = 0 … μ,
@@ -79,10 +77,13 @@ def jumps(
     """
     if structure.a == 0:  # without constraints the state follows no jump
         return lambda _, before: Jump(before, np.zeros((structure.mu, system.n)))
-    levels, n, beside = structure.mu + 1, system.n, times + widths
-    after = system.coefficients.taylor(times, structure.mu, beside)
-    left = system.coefficients.taylor(times, 0, times - widths)
-    form = strangeness_free_form(system, structure, times, beside, after)
+    levels, n, units = structure.mu + 1, system.n, structure.scaling
+    c = system.coefficients.taylor(times, structure.mu, after)
+    form = form or strangeness_free_form(system, structure, times, after, c)
+    left = system.coefficients.taylor(times, 0, before)
+    scales = units.rows, units.columns, units.time
+    (e, a), (e0, a0) = scaled(c.E, c.A, *scales, levels), scaled(left.E, left.A, *scales, 1)
+    changes = e[0] - e0[0], a[0] - a0[0]
 
     def at(part: Array, k: int) -> Array:
         """Of matrices at all times, or of one that is the same at all."""
@@ -96,18 +97,21 @@ def jumps(
         for j in range(levels):
             for i in range(j, levels):
                 sign = (-1.0) ** (i - j) * perm(i, i - j)
-                blocks[j, :, i] += sign * after.E[i - j, k]
+                blocks[j, :, i] += sign * at(e[i - j], k)
                 if i + 1 < levels:
-                    blocks[j, :, i + 1] -= sign * after.A[i - j, k]
-        whole[levels * n :, 0] = A2
+                    blocks[j, :, i + 1] -= sign * at(a[i - j], k)
+        whole[levels * n :, 0] = A2 * units.columns
         matrix, right = whole.reshape(len(whole), -1), np.zeros(len(whole))
         right[levels * n :] = -(form.f2[k] + A2 @ before)
+        if not (np.isfinite(matrix).all() and np.isfinite(right).all()):
+            return Jump(np.full(n, np.nan), np.zeros((structure.mu, n)))
         # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
         size = np.abs(matrix).max(axis=1)
         size[size == 0] = 1.0
         w, *_ = np.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)
         residual = np.abs(matrix @ w - right) / size
-        scale = max(float(x.max(initial=1e-300)) for x in (np.abs(right / size), np.abs(before)))
+        known = np.abs(right / size), np.abs(before / units.columns)
+        scale = max(float(x.max(initial=1e-300)) for x in known)
         if residual.max(initial=0.0) > 1e-7 * scale:
             raise ModelError(
                 f"plant {system.name}: the jump at t = {t:.6g} has no solution "
@@ -115,13 +119,10 @@ def jumps(
                 "equations; use an input without it, or a horizon that ends before"
             )
         w = w.reshape(levels, n)
-        impulses = np.where(np.abs(w[1:]) > _IMPULSE * scale, w[1:], 0.0)
+        w[1:][np.abs(w[1:]) <= _IMPULSE * scale] = 0.0
         # E or A may jump only where it is not multiplied by an impulse.
-        for name, (before_it, after_it), factors in (
-            ("E", (left.E[0, k], after.E[0, k]), [w[0], *impulses]),
-            ("A", (left.A[0, k], after.A[0, k]), [*impulses]),
-        ):
-            change = after_it - before_it
+        for name, all_changes, factors in zip("EA", changes, (w, w[1:]), strict=True):
+            change = at(all_changes, k)
             most = max((np.abs(change @ factor).max() for factor in factors), default=0.0)
             if most > 1e-9 * scale * max(1.0, float(np.abs(change).max())):
                 raise ModelError(
@@ -129,8 +130,9 @@ def jumps(
                     "impulse or a jump of its own, and their product is undefined; take the "
                     "conserved quantity (charge, momentum) as the state"
                 )
+        w *= units.columns * units.time ** np.arange(levels)[:, None]
         # On the constraints to the last digit: a component that they make zero is zero.
         state = at(form.basis, k) @ (at(form.E1, k) @ (before + w[0])) + form.offset[k]
-        return Jump(state, impulses)
+        return Jump(state, w[1:])
 
     return jump

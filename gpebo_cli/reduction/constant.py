@@ -36,7 +36,6 @@ class ConstantForm:
     through: Array  # (d, n)
     mu: int
     pivot: float  # the smallest singular value that counts, relative
-    weights: Array  # (n,) see ``scaling.Scaling``
     offset: Array  # (N, n)
     f: Array  # (N, d)
     # Sizes of the terms of the offset (n,)
@@ -131,8 +130,7 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
     return ConstantForm(
         of_a @ free / time, columns[:, None] * free, of_e / columns,
         constrained @ known_in * powers * rows, of_f * rows / time, of_a / columns / time,
-        levels - 1, least, 10.0 ** np.rint(np.log10(rows / rows[0])), np.zeros((1, n)),
-        np.zeros((1, d)),
+        levels - 1, least, np.zeros((1, n)), np.zeros((1, d)),
     )
 
 

@@ -58,7 +58,6 @@ class Explicit:
     mu: int
     state_units: Array  # (n,)
     pivot: float  # the smallest one at any time, relative to its row
-    weights: Array  # (n,) see ``scaling.Scaling``
     moved: Mapping[str, BoolArray]  # of which values (v,) of E and A derivatives may be needed
     known: float = 0.0  # sizes of what is known in the states
     loss: float = 1.0  # by how much elimination may have made rounding grow
@@ -325,7 +324,7 @@ def explicit_form(found: Entries, scaling: Scaling, f: Row) -> Explicit:
     del A.rows  # what is known comes in the place of that
     return Explicit(
         states, matrix, A.forcing(chosen), left,
-        count, mu, units, min(E.least, A.least), scaling.weights, moved,
+        count, mu, units, min(E.least, A.least), moved,
     )
 
 

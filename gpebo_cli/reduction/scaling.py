@@ -43,9 +43,6 @@ class Scaling:
     rows: Array  # (n,)
     columns: Array  # (n,) x = columns * x̃
     time: float  # τ, derivatives are taken with respect to t/τ
-    # Powers of ten by which the rows of E are of comparable size: equations within a decade of
-    # each other count as they were written.
-    weights: Array  # (n,)
 
 
 class Units(NamedTuple):
@@ -93,11 +90,8 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
 def _scaling(factors: Array) -> Scaling:
     """From the logarithms of the factors (2 n + 1,)."""
     n = len(factors) // 2
-    r = factors[:n]
-    # A factor of all rows is left open, and means nothing.
-    weights = 10.0 ** np.rint((r - r[:1]) / np.log(10.0))
     powers = np.exp2(np.rint(factors / np.log(2.0)))
-    return Scaling(powers[:n], powers[n:-1], float(powers[-1]), weights)
+    return Scaling(powers[:n], powers[n:-1], float(powers[-1]))
 
 
 def units_at(c: Coefficients) -> Units:

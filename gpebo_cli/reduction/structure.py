@@ -85,7 +85,7 @@ def without_equations() -> Structure:
     """That of a system without states: there is nothing to reduce."""
     none, ones = np.zeros(0, dtype=np.intp), np.ones(0)
     return Structure(
-        mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0, ones), rank_tol=0.0,
+        mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0), rank_tol=0.0,
         smallest_singular_value=np.inf, time_invariant=True,
         reference=Pivots(none, none, 0, np.zeros((0, 0))), steady=True, dynamics=None,
     )

@@ -62,23 +62,31 @@ def _array(
 
 
 def consistent_start(
-    system: DescriptorSystem, structure: Structure, t: float, inside: float
+    system: DescriptorSystem, structure: Structure, t: Array, inside: Array
 ) -> Array:
-    """``consistent_state`` (n,) of this path, by singular vectors of the derivative array."""
-    now, scaling, x0 = np.array([t]), structure.scaling, system.initial_state
-    M, N, g = _array(system, structure, now, np.array([inside]), structure.mu)
-    Z2 = np.linalg.svd(M[0])[0][:, len(M[0]) - structure.a :]
-    constraints = Z2.T @ N[0]
-    size = np.abs(constraints).max(axis=1, initial=0.0)
-    constraints, missing = constraints / size[:, None], (Z2.T @ g[0])[:, 0] / size
-    wrong = missing + constraints @ (x0 / scaling.columns)
-    U, sigma, Vt = np.linalg.svd(constraints)
-    moved = -Vt[: len(sigma)].T @ ((U.T @ wrong) / sigma)
-    kernel = Vt[len(sigma) :].T
-    E = system.coefficients.taylor(now, 0, np.array([inside])).E[0, 0]
-    image = scaling.weights[:, None] * E * scaling.columns
-    free = np.linalg.lstsq(image @ kernel, -image @ moved, rcond=None)[0]
-    return np.asarray(x0 + scaling.columns * (moved + kernel @ free))
+    """``consistent_state`` (n,) of this path: what jumps leave is told by the adjoint equation.
+
+    For every smooth solution of Eᵀp' = −(A + E')ᵀp, (pᵀE x)' = pᵀf: pᵀE x does not jump where x
+    does. The consistent p are those that the constraints of that equation leave.
+    """
+    scaling, x0, mu = structure.scaling, system.initial_state, structure.mu
+    M, N, g = _array(system, structure, t, inside, mu)
+    c = system.coefficients.taylor(t, mu + 1, inside)
+    e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 2)
+    turned = -a[:-1] - np.arange(1, mu + 2)[:, None, None, None] * e[1:]
+    adjoint = derivative_array(np.swapaxes(e, 2, 3), np.swapaxes(turned, 2, 3), mu)
+
+    def constraints(M: Array, N: Array) -> tuple[Array, Array]:
+        """Z2ᵀ and Z2ᵀN."""
+        Z2 = np.linalg.svd(M[0])[0][:, len(M[0]) - structure.a :]
+        return Z2.T, Z2.T @ N[0]
+
+    kept = np.linalg.svd(constraints(*adjoint)[1])[2][structure.a :] @ e[0, 0]
+    Z2, A2 = constraints(M, N)
+    missed = Z2 @ g[0, :, 0] + A2 @ (x0 / scaling.columns)
+    whole, right = np.concatenate([kept, A2]), np.concatenate([np.zeros(len(kept)), -missed])
+    size = np.linalg.norm(whole, axis=1)
+    return np.asarray(x0 + scaling.columns * np.linalg.solve(whole / size[:, None], right / size))
 
 
 def solve(

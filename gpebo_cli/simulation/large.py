@@ -103,7 +103,7 @@ class _Plant:
             self.entries(mesh, every)
         while not self.eliminated:
             try:
-                self.form = self._form(self.found, forcing(self.found))
+                self.form = self.form_of(self.found, forcing(self.found))
             except MoreOrdersError:
                 if self.moved:
                     self.moved = {}
@@ -123,7 +123,8 @@ class _Plant:
                 self.found = self.found._replace(values=kept, moved={})
         return self.form
 
-    def _form(self, found: Entries, f: Row) -> Explicit | ConstantForm:
+    def form_of(self, found: Entries, f: Row) -> Explicit | ConstantForm:
+        """The explicit form of these entries, with what is known in the equations."""
         n, (E, A) = self.system.n, (getattr(found.values, name) for name in "EA")
         may_be_full = n > _FULL and E.shape[1] == A.shape[1] == 1
         if self.constant is None and not (may_be_full and len(found.which("E")) > _ENTRIES * n):
@@ -243,7 +244,7 @@ def _simulated(
         plant.matrix_tail, plant.eliminate, mesh, plant.eliminate(mesh), tol,
         solver.max_elements,
     )
-    x0, z0 = _start(plant)
+    x0, z0 = _start(plant, mesh)
     floor_z = SHARE * np.abs(form.reduced(x0))[:, None]
     floor = form.sizes_from(floor_z)
     del form  # there may be others, on meshes that are finer
@@ -302,32 +303,55 @@ def _signals(plant: _Plant, z: Array) -> tuple[Array, Array, Array]:
     return tuple(s.reshape(*points, -1) for s in (x, y.T, u))  # type: ignore[return-value]
 
 
-def _start(plant: _Plant) -> tuple[Array, Array]:
+def _start(plant: _Plant, mesh: Mesh) -> tuple[Array, Array]:
     """The consistent state (n,) at the start, and those of it that are integrated (d,).
 
-    Without hidden constraints these are as they were asked for. With them the differential part
-    is kept as far as it may be: ‖W E (x − x_0)‖ is least.
+    Without hidden constraints these are as they were asked for; otherwise see :func:`_conserved`.
     """
     form, x0 = plant.form, plant.system.initial_state
     z = form.reduced(x0)
     first = form.at_first()
 
     def differential(z: Array) -> Array:
-        """E (x − x_0) of the state that z gives, (n,)."""
-        off = first.states_from(z[None, :, None])[0, :, 0] - x0
+        """E (x − x_0) of the states that z (d, c) gives, (n, c)."""
+        found, off = np.zeros((len(x0), z.shape[1])), first.states_from(z[None])[0] - x0[:, None]
         (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0, plant.found.which("E")]
-        return np.asarray(np.bincount(i, values * off[j], len(x0)))
+        np.add.at(found, i, values[:, None] * off[j])
+        return found
 
-    missed = differential(z)
+    missed = differential(z[:, None])
     size = np.abs(form.sizes_from(np.abs(z)[:, None])[:, 0]).max(initial=0.0)
     if np.abs(missed).max(initial=0.0) > _ROUNDING * EPS * max(size, np.abs(x0).max(initial=0.0)):
-        weights = form.weights
-        moves = np.array([weights * (differential(z + e) - missed) for e in np.eye(len(z))]).T
-        z = z - np.linalg.lstsq(moves, weights * missed, rcond=None)[0]
+        moves = differential(z[:, None] + np.eye(len(z))) - missed
+        kept = _conserved(plant, mesh).T
+        z = z - np.linalg.solve(kept @ moves, kept @ missed)[:, 0]
     x = first.states_from(z[None, :, None])[0, :, 0]
     known = np.abs(x - x0) <= _ROUNDING * EPS * (first.sizes_from(np.abs(z)[:, None])[:, 0]
                                                  + np.abs(x0))
     return np.where(known, x0, x), z
+
+
+def _conserved(plant: _Plant, mesh: Mesh) -> Array:
+    """Vectors p (n, d) of which pᵀE x does not jump where x does, at the start.
+
+    They are consistent states of the adjoint equation Eᵀp' = −(A + E')ᵀp: for its smooth solutions
+    (pᵀE x)' = pᵀf (UndecidedError: elimination does not solve it).
+    """
+    adjoint = _Plant(plant.system, plant.most)
+    adjoint.order = plant.form.mu + 1
+    t, inside = mesh.points[0, :1], mesh.inside[0, :1]
+    now = entries(plant.system.coefficients, t, adjoint.order, inside)
+    E, A = now.of("E"), {place: -v[:-1] for place, v in now.of("A").items()}
+    for place, v in E.items():
+        if v[1:].any():
+            A[place] = A.get(place, 0.0) - np.arange(1, len(v))[:, None] * v[1:]
+    places, values = {}, {}
+    for name, terms in (("E", E), ("A", A)):
+        places[name] = tuple(np.array([*terms]).T[::-1])
+        values[name] = np.stack([v[: adjoint.order] for v in terms.values()], axis=2)
+    form = adjoint.form_of(Entries(now.values._replace(**values), places), {})
+    found: Array = form.states_from(np.eye(form.d)[None])[0]
+    return found
 
 
 def _result(

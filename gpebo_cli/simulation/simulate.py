@@ -45,7 +45,7 @@ _SAME = 1e3  # tolerances, by which a closer look moves nothing
 
 
 def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSettings) -> Simulation:
-    """Solve E x' = A x + B u + F θ + φ from a consistent state near ``system.initial_state``.
+    """Solve E x' = A x + B u + F θ + φ from the state that follows from ``initial_state``.
 
     Raises:
         ModelError: not uniquely solvable, index too high, or a rank changes within the horizon.
@@ -109,7 +109,7 @@ def _simulate_linear(
 ) -> Simulation:
     """:func:`simulate` for a plant whose matrices depend on time and inputs only."""
     structure = structure or dense_structure(system, time, solver)
-    start, (mesh, cuts, bounded) = time.start, first_mesh(system, time, solver)
+    mesh, cuts, bounded = first_mesh(system, time, solver)
     mesh, c, terms = _known_resolved(system, structure, mesh, cuts, solver, bounded=bounded)
     # Of many elements some are looked at, and the equations are made where they are solved.
     few = mesh.size <= _AT_ONCE or structure.time_invariant
@@ -120,16 +120,7 @@ def _simulate_linear(
     )
     del c  # as much as all that is made of it
     independent = solver.name == "ivp"  # the underlying ODE of the derivative array, by scipy
-    if independent:
-        x0 = ivp.consistent_start(system, structure, start, float(mesh.inside[0, 0]))
-    else:
-        x0 = consistent_state(first, system.initial_state, structure.scaling.weights)
-    if not np.isfinite(x0).all():
-        raise ModelError(
-            f"plant {system.name}: no finite consistent state at the start; look for entries that "
-            "are huge or infinite there"
-        )
-
+    x0 = _start(system, structure, mesh, None if independent else first)
     happened: dict[float, tuple[Array, Jump]] = {}
     restarts = _restarts(system, structure, cuts, mesh.edges, happened)
 
@@ -191,6 +182,26 @@ def _simulate_linear(
         state_errors=solution.errors[:, 0], lost=solution.lost,
         vague=None if solution.vague is None else solution.vague[:, 0],
     )
+
+
+def _start(
+    system: DescriptorSystem, structure: Structure, mesh: Mesh, form: StrangenessFree | None
+) -> Array:
+    """The consistent state (n,) at the start, with the equations there or by the other path."""
+    t, inside = mesh.points[0, :1], mesh.inside[0, :1]
+    if form is None:
+        x0 = ivp.consistent_start(system, structure, t, inside)
+    else:
+        def step(before: Array) -> Array:
+            return jumps(system, structure, t, inside, inside, form)(0, before).after
+
+        x0 = consistent_state(form, system.initial_state, step)
+    if not np.isfinite(x0).all():
+        raise ModelError(
+            f"plant {system.name}: no finite consistent state at the start; look for entries that "
+            "are huge or infinite there"
+        )
+    return x0
 
 
 def _known_resolved(
@@ -319,7 +330,8 @@ def _restarts(
     if not len(cuts):
         return {}
     k, steps = np.searchsorted(edges, cuts), np.diff(edges)
-    at = jumps(system, structure, cuts, 1e-3 * np.minimum(steps[k], steps[k - 1]))
+    beside = 1e-3 * np.minimum(steps[k], steps[k - 1])
+    at = jumps(system, structure, cuts, cuts - beside, cuts + beside)
 
     def restart(k: int, t: float, before: Array) -> Array:
         what = at(k, before[:, 0])
