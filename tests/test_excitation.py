@@ -14,7 +14,12 @@ from scipy.integrate import quad_vec, trapezoid
 from scipy.optimize import brentq
 
 from gpebo_cli import run
-from gpebo_cli.evidence.excitation import assess, persistent, sampled_window_level
+from gpebo_cli.evidence.excitation import (
+    assess,
+    persistent,
+    sampled_window_level,
+    window_level,
+)
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -61,6 +66,15 @@ def test_eigenvalues_and_window_against_quadrature():
     for k in (50, 111, 200):
         expected = np.linalg.eigvalsh(gram(three, T[k] - 2.5, T[k]))[0]
         assert found.pe_level[k] == pytest.approx(expected, abs=1e-12)
+
+
+def test_a_window_is_whole_in_any_unit_of_time():
+    """In picoseconds a hundredth of a window once counted as rounding."""
+    signal, tiny = outer(CLEAN), 1e-12
+    mesh = Mesh(tiny * signal.mesh.edges, signal.mesh.rule)
+    one = window_level([[signal]], T, 2.5)
+    other = window_level([[Trajectory(mesh, signal.values)]], tiny * T, tiny * 2.5)
+    np.testing.assert_allclose(other / tiny, one, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

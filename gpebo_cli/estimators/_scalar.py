@@ -68,7 +68,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     λ in 1/s is (p,) or whatever broadcasts against the signal. It starts at 0 or ``start``.
     """
     edges = signal.mesh.edges
-    smallest = 1e-13 * max(1.0, abs(float(edges[0])), abs(float(edges[-1])))
+    smallest = 1e-13 * float(np.abs(edges[[0, -1]]).max())
     fastest = float(np.max(rate))
     while True:
         filtered, mesh = signal.low_pass(rate, start), signal.mesh

@@ -262,7 +262,7 @@ def window_level(
     are [ψᵀψ | ·] (p, p + c) from one reset to the next, part by part. What was seen before a reset
     counts for the parameters after it: T⁻ᵀ G T⁻¹, as in ``ExtensionState.after``.
     """
-    level, start, slack = np.full(len(t), np.nan), t - window, 1e-12 * max(1.0, window)
+    level, start, slack = np.full(len(t), np.nan), t - window, 1e-9 * window
     gram, whole = np.zeros((0, 0, 0)), np.zeros(0, dtype=np.intp)
     size: Array | float = 0.0
     for k, parts in enumerate(segments):
