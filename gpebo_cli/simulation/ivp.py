@@ -71,9 +71,10 @@ def consistent_start(
     """
     scaling, x0, mu = structure.scaling, system.initial_state, structure.mu
     M, N, g = _array(system, structure, t, inside, mu)
-    c = system.coefficients.taylor(t, mu + 1, inside)
-    e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 2)
-    turned = -a[:-1] - np.arange(1, mu + 2)[:, None, None, None] * e[1:]
+    c = system.coefficients.taylor(t, mu, inside)
+    e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
+    slope = np.arange(1, mu + 1)[:, None, None, None] * e[1:]
+    turned = -a - np.concatenate([slope, 0.0 * e[:1]])  # more of E' has no effect
     adjoint = derivative_array(np.swapaxes(e, 2, 3), np.swapaxes(turned, 2, 3), mu)
 
     def constraints(M: Array, N: Array) -> tuple[Array, Array]:

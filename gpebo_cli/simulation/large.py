@@ -338,17 +338,18 @@ def _conserved(plant: _Plant, mesh: Mesh) -> Array:
     (pᵀE x)' = pᵀf (UndecidedError: elimination does not solve it).
     """
     adjoint = _Plant(plant.system, plant.most)
-    adjoint.order = plant.form.mu + 1
+    adjoint.order = plant.order  # more of E' has no effect
     t, inside = mesh.points[0, :1], mesh.inside[0, :1]
-    now = entries(plant.system.coefficients, t, adjoint.order, inside)
-    E, A = now.of("E"), {place: -v[:-1] for place, v in now.of("A").items()}
+    now = entries(plant.system.coefficients, t, plant.order, inside)
+    E, A = now.of("E"), {place: -v for place, v in now.of("A").items()}
     for place, v in E.items():
         if v[1:].any():
-            A[place] = A.get(place, 0.0) - np.arange(1, len(v))[:, None] * v[1:]
+            slope = np.append(np.arange(1, len(v))[:, None] * v[1:], [[0.0]], axis=0)
+            A[place] = A.get(place, 0.0) - slope
     places, values = {}, {}
     for name, terms in (("E", E), ("A", A)):
         places[name] = tuple(np.array([*terms]).T[::-1])
-        values[name] = np.stack([v[: adjoint.order] for v in terms.values()], axis=2)
+        values[name] = np.stack([*terms.values()], axis=2)
     form = adjoint.form_of(Entries(now.values._replace(**values), places), {})
     found: Array = form.states_from(np.eye(form.d)[None])[0]
     return found
