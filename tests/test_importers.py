@@ -353,7 +353,7 @@ def test_an_unknown_source_is_estimated():
 
 @pytest.mark.parametrize(("text", "value"), [
     ("4.7k", 4700.0), ("10uF", 1e-5), ("1meg", 1e6), ("1MEG", 1e6), ("2m", 2e-3), ("1e-3", 1e-3),
-    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10),
+    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10), ("2\u00b5F", 2e-6), ("2\u03bc", 2e-6),
 ])
 def test_suffixes(text, value):
     assert number(text) == pytest.approx(value, rel=1e-15)
@@ -390,11 +390,34 @@ def test_what_continues_and_what_is_a_comment():
     ("= R1 a 0 1", "= needs a name before it"), (".param\nR1 a 0 1", ".param needs name=value"),
     (".subckt s a b\n.subckt r a b", ".subckt inside .subckt s"),
     (".subckt s", "needs a name and nodes"), (".ends", ".ends without .subckt"),
+@given(digits=st.integers(1, 99), suffix=st.sampled_from("kmunpx"), behind=st.integers(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_digits_behind_a_suffix_are_not_put_behind_the_number(digits, suffix, behind):
+    """4k7 is 4.7k to some, and was 4000.07 here."""
+    word = f"{digits}{suffix}{behind}"
+    for value in (word, f"{{2*{word}}}"):
+        with refused(f"line 2: R1: {word} is no number"):
+            from_netlist(f"t\nR1 a 0 {value}\n")
+
+
+@given(name=st.sampled_from(["t", "T", "time", "d", "step", "pi", "lambda", "r", "v1"]))
+@settings(max_examples=9, deadline=None)
+def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
+    plant = plant_of(f"t\n.param {name}=0.25\nV1 a 0 {{8*{name}}}\nR1 a 0 {{{name.upper()}}}\n")
+    found = plant_from_mapping(plant).coefficients.taylor(np.array([3.0]), 0)
+    assert found.u.ravel() == 2
+    assert -1 / found.A[0, 0, 0, 0] == 0.25
+
+
     (".subckt s a b\nR1 a b 1", ".subckt s has no .ends"),
     (".subckt s a b\nR1 a b 1\n.ends\nX1 a s", "X1 has 1 nodes and the subcircuit s has 2"),
     (".subckt s a r=1\nR1 a 0 {r}\n.ends\nX1 a s rr=2", "s has no parameter rr; did you mean r"),
     (".model d d\nR1 a 0 1", ".model is not read"),
-    ("K1 L1 L2", "two inductors and a coefficient"),
+    ("K1 L1 L2", "two inductors and a coefficient"), ("K1 L1 l1 1", "K1 needs two inductors"),
+    (".global vdd", "line 2: .global is not read; give each subcircuit a node"),
+    (".subckt s gnd\nR1 gnd 0 1\n.ends\nX1 a s\nV1 a 0 1", "X1: ground, a node of"),
+    (".subckt s a\nR1 a m 1\nC1 m 0 1\n.ends\nX1 b s\nR1 b x1_m 1", "line 7: the node x1_m and"),
+    (".subckt s a\nR1 a m 1\nR2 m 0 1\n.ends\nX2 x1_m s\nX1 x1_m s", "line 3: the node m and one"),
     ("R1 a 0 1 ic=2", "R1: ic= is not read here"), ("R1 a 0 1 tc1=2", "tc1= changes the value"),
     ("T1 a 0 b 0 2", "T1 needs n=RATIO"), ("F1 a 0", "needs the voltage source whose current"),
     ("S1 a 0", "S1 needs its instants"), ("S1 a 0 on=x", "on=x has to be times in seconds"),

@@ -30,15 +30,16 @@ NODES = {"R": 2, "L": 2, "C": 2, "V": 2, "I": 2, "E": 4, "G": 4, "F": 2, "H": 2,
 """Kinds of elements with the number of their nodes; K couples two inductors and has none."""
 
 _NUMBER = re.compile(
-    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|mil|[tgxkmunpf]?)[a-z]*", re.IGNORECASE
+    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)"
+    r"(meg|mil|[tgxkmu\u00b5\u03bcnpf]?)[a-z]*", re.IGNORECASE
 )
 _SUFFIXES = {
     "t": 1e12, "g": 1e9, "meg": 1e6, "x": 1e6, "k": 1e3, "mil": 25.4e-6, "m": 1e-3, "u": 1e-6,
-    "n": 1e-9, "p": 1e-12, "f": 1e-15,
+    "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15,
 }
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _IN_EXPRESSION = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[A-Za-z]*)|(?P<word>[A-Za-z_]\w*)"
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\w*)|(?P<word>[A-Za-z_]\w*)"
 )
 
 
@@ -264,13 +265,17 @@ class Netlist:
         plain = number(inner.strip())
         if plain is not None:
             return plain
-        known = {**{name: name for name in RESERVED}, **scope.known, "time": "t", "t": "t"}
+        known = {**{name: name for name in RESERVED}, "time": "t", **scope.known}
 
         def translated(match: re.Match[str]) -> str:
             if match["number"]:
                 digits = str(match["number"])
-                found = None if digits[-1].isdigit() or digits[-1] == "." else number(digits)
-                return digits if found is None else repr(found)
+                found = number(digits)
+                if found is None:
+                    raise scope.place.error(
+                        f"{what}: {digits} is no number; its suffix stands behind it, as in 4.7k"
+                    )
+                return digits if digits[-1].isdigit() or digits[-1] == "." else repr(found)
             word = match["word"].lower()
             if word not in known:
                 raise scope.place.error(
@@ -364,7 +369,7 @@ class Netlist:
 
     def _coupling(self, plain: Sequence[str], scope: _Scope) -> Element:
         name, place = plain[0], scope.place
-        if len(plain) != 4:
+        if len(plain) != 4 or plain[1].lower() == plain[2].lower():
             raise place.error(f"{name} needs two inductors and a coefficient, as K1 L1 L2 0.9")
         value = self.value(plain[3], scope, name)
         if isinstance(value, float) and not abs(value) <= 1.0:
