@@ -361,6 +361,21 @@ def test_suffixes(text, value):
 
 def test_what_continues_and_what_is_a_comment():
     netlist = read_netlist("title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n")
+@given(words=st.permutations(
+    ["/in", "net-(r1-pad1)", "1.2", "n$1", "out+", "in", "vin", "a_b", "a-b"]
+))
+@settings(max_examples=5, deadline=None)
+def test_nodes_may_be_called_anything(words):
+    """A chain of resistors with 9 V across nine of them, and a source that is called as a node."""
+    chain = "\n".join(f"R{k} {a} {b} 1" for k, (a, b) in enumerate(pairwise([*words, "0"])))
+    text = f"t\nvin {words[0]} 0 9\n{chain}\nC1 {words[-1]} 0 1\n.ic v({words[-1]})=2\n"
+    plant = plant_of(text, measure=[f"v({word.upper()})" for word in words], unknown="VIN")
+    assert list(plant["initial_state"].values()).count(2.0) == 1
+    assert len(plant["unknowns"]) == 1
+    result = simulated(plant, 40.0)
+    np.testing.assert_allclose([result[y][-1] for y in plant["outputs"]], range(9, 0, -1))
+
+
     assert [(e.name, e.value) for e in netlist.elements.values()] == [("C1", 1.0), ("R1", 5.0)]
 
 

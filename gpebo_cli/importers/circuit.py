@@ -23,10 +23,11 @@ from gpebo_cli.schema import nearest, shown
 
 _NO_NAMES = {*RESERVED, *keyword.kwlist}
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
-_QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
+_QUANTITY = re.compile(r"([vi])\(([^,]+?)(?:,([^,]+))?\)", re.IGNORECASE)
 _ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
 _TERM = re.compile(
-    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE
+    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?"
+    r"([vi]\((?:[^()]|\([^()]*\))+\))", re.IGNORECASE
 )
 
 
@@ -179,8 +180,9 @@ class _Builder:
             draft.parameters[self._claim(key, key)] = value
         nodes = {node for e in self.elements.values() for node in e.nodes} - {GROUND}
         for node in sorted(nodes, key=_natural):
-            plain = node.isidentifier() and node not in _NO_NAMES
-            label = self._claim(node if plain else f"v{node}", f"v_{node}")
+            word = re.sub(r"\W", "_", node, flags=re.ASCII)
+            plain = word == node and not word[0].isdigit() and word not in _NO_NAMES
+            label = self._claim(word if plain else f"v{word}", f"v_{word}")
             self._node[node] = label
             self._row[node] = draft.equation(f"currents at node {node}")
             draft.states[label] = (self.netlist.initial.get(f"v({node})", 0.0), "V")

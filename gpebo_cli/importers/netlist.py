@@ -94,7 +94,7 @@ class _Scope(NamedTuple):
 
     def quantity(self, text: str) -> str:
         """``v(node)`` or ``i(element)`` as the plant has them, anything else as it stands."""
-        match = re.fullmatch(r"([vi])\((\w+)\)", text.replace(" ", ""))
+        match = re.fullmatch(r"([vi])\(([^,]+)\)", text.replace(" ", ""))
         if match is None:
             return text
         name = self.node(match[2]) if match[1] == "v" else self.prefix + match[2]
@@ -222,6 +222,7 @@ class Netlist:
     parameters: dict[str, float | str] = field(default_factory=dict)
     initial: dict[str, float] = field(default_factory=dict)  # by ``v(out)`` or ``i(l1)``
     saved: list[str] = field(default_factory=list)  # quantities
+    _inside: dict[str, str] = field(default_factory=dict)  # in what, by prefix, a node is
 
     def expand(self, block: _Block, scope: _Scope) -> None:
         """Read the lines of a block, in which its own parameters are known, too."""
@@ -303,6 +304,10 @@ class Netlist:
             raise place.error(
                 f"{head} would read another file, and a netlist is read alone; put its lines here"
             )
+        elif head == ".global":
+            raise place.error(
+                ".global is not read; give each subcircuit a node of its own for it, and hand it on"
+            )
         elif head in (".model", ".func"):
             raise place.error(
                 f"{head} is not read: elements are linear, R L C K V I E G F H S T X, and "
@@ -335,11 +340,28 @@ class Netlist:
                     + nearest(key, block.defaults)
                 )
         inside = scope.prefix + plain[0].lower() + "_"
-        ports = dict(zip(block.ports, map(scope.node, ends), strict=True))
+        ports = dict(zip(block.ports, self._nodes(ends, scope), strict=True))
+        if ports.get(GROUND, GROUND) != GROUND:
+            raise place.error(
+                f"{plain[0]}: ground, a node of the subcircuit {block.name}, cannot be "
+                f"{ports[GROUND]} outside; call it otherwise inside"
+            )
         inner = dict(scope.known)
         for key, default in block.defaults.items():
             inner[key] = self._parameter(inside + key, given.get(key, default), scope)
         self.expand(block, _Scope(ports, inner, inside, scope.depth + 1))
+
+    def _nodes(self, words: Sequence[str], scope: _Scope) -> tuple[str, ...]:
+        """Nodes as the plant has them (ConfigError: one in something else is called the same)."""
+        found = tuple(map(scope.node, words))
+        for word, node in zip(words, found, strict=True):
+            own = scope.prefix if node != GROUND and _node(word) not in scope.nodes else None
+            if own is not None and self._inside.setdefault(node, own) != own:
+                raise scope.place.error(
+                    f"the node {word} and one of another (sub)circuit are both {node} in the "
+                    "plant; call one otherwise"
+                )
+        return found
 
     def _element(self, plain: list[str], options: dict[str, str], scope: _Scope) -> None:
         name, kind, place = plain[0], plain[0][0].upper(), scope.place
@@ -354,7 +376,7 @@ class Netlist:
             ends, rest = plain[1 : 1 + count], plain[1 + count :]
             if len(ends) < count:
                 raise place.error(f"{name} needs {count} nodes and has {len(ends)}")
-            where = tuple(map(scope.node, ends))
+            where = self._nodes(ends, scope)
             element = self._valued(kind, name, where, rest, options, scope)
         full = scope.prefix + name
         if not _WORD.fullmatch(full):
