@@ -32,6 +32,7 @@ from gpebo_cli.importers import from_control, from_file, from_matrices, from_mec
 from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.mechanics import linearise
 from gpebo_cli.importers.netlist import number, read_netlist
+from gpebo_cli.model.expressions import parse
 from gpebo_cli.model.plant import plant_from_mapping
 
 PAPER = """electrical circuit of the paper
@@ -262,6 +263,21 @@ def test_sources_are_those_of_spice(source, expected):
     np.testing.assert_allclose(u, expected(t), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("edge", [0.0, 1e-9, 1e-4])
+def test_steep_edges_of_pulses_leave_all_digits(edge):
+    """Some pulses are over at t = 0."""
+    plant = plant_of(f"t\nV1 a 0 PULSE(1 6 -3m {edge} {edge} 0.3m 1m 9)\nR1 a 0 1\n")
+    starts = 1e-3 * np.arange(6)
+    for away, value in ((1.7e-4, 6), (7e-4, 1)):
+        found = plant_from_mapping(plant).coefficients.taylor(starts + away, 0).u
+        np.testing.assert_allclose(found.ravel(), value, rtol=1e-15)
+
+
+def test_as_many_pulses_are_read_as_is_said():
+    text = from_netlist("t\nV1 a 0 PULSE(0 1 0 1n 1n 0.3m 1m 1000)\nR1 a 0 1\n").inputs["V1"][0]
+    assert parse(text, {}, "V1").text.count("step") == 6000
+
+
 def test_coupled_coils_are_three_that_are_not():
     coils = "t\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nR2 b 0 3\n"
     M = 0.5 * np.sqrt(2)
@@ -345,22 +361,6 @@ def test_what_is_controlled_may_determine_a_loop_or_a_cutset(text, measure, valu
     assert simulated(plant)[plant["outputs"][0]][-1] == pytest.approx(value, rel=1e-12)
 
 
-def test_an_unknown_source_is_estimated():
-    text = "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1k\nC1 b 0 1m ic=0.2\nI5 b 0 2u\n"
-    result = run(plant_of(text, measure="v(b)", unknown="I5"), estimator="ls_drem")
-    assert result.estimates["I5"][0, -1] == pytest.approx(2e-6, rel=1e-6)
-
-
-@pytest.mark.parametrize(("text", "value"), [
-    ("4.7k", 4700.0), ("10uF", 1e-5), ("1meg", 1e6), ("1MEG", 1e6), ("2m", 2e-3), ("1e-3", 1e-3),
-    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10), ("2\u00b5F", 2e-6), ("2\u03bc", 2e-6),
-])
-def test_suffixes(text, value):
-    assert number(text) == pytest.approx(value, rel=1e-15)
-
-
-def test_what_continues_and_what_is_a_comment():
-    netlist = read_netlist("title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n")
 @given(words=st.permutations(
     ["/in", "net-(r1-pad1)", "1.2", "n$1", "out+", "in", "vin", "a_b", "a-b"]
 ))
@@ -376,6 +376,41 @@ def test_nodes_may_be_called_anything(words):
     np.testing.assert_allclose([result[y][-1] for y in plant["outputs"]], range(9, 0, -1))
 
 
+def test_an_unknown_source_is_estimated():
+    text = "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1k\nC1 b 0 1m ic=0.2\nI5 b 0 2u\n"
+    result = run(plant_of(text, measure="v(b)", unknown="I5"), estimator="ls_drem")
+    assert result.estimates["I5"][0, -1] == pytest.approx(2e-6, rel=1e-6)
+
+
+@pytest.mark.parametrize(("text", "value"), [
+    ("4.7k", 4700.0), ("10uF", 1e-5), ("1meg", 1e6), ("1MEG", 1e6), ("2m", 2e-3), ("1e-3", 1e-3),
+    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10), ("2\u00b5F", 2e-6), ("2\u03bc", 2e-6),
+])
+def test_suffixes(text, value):
+    assert number(text) == pytest.approx(value, rel=1e-15)
+
+
+@given(digits=st.integers(1, 99), suffix=st.sampled_from("kmunpx"), behind=st.integers(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_digits_behind_a_suffix_are_not_put_behind_the_number(digits, suffix, behind):
+    """4k7 is 4.7k to some, and was 4000.07 here."""
+    word = f"{digits}{suffix}{behind}"
+    for value in (word, f"{{2*{word}}}"):
+        with refused(f"line 2: R1: {word} is no number"):
+            from_netlist(f"t\nR1 a 0 {value}\n")
+
+
+@given(name=st.sampled_from(["t", "T", "time", "d", "step", "pi", "lambda", "r", "v1"]))
+@settings(max_examples=9, deadline=None)
+def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
+    plant = plant_of(f"t\n.param {name}=0.25\nV1 a 0 {{8*{name}}}\nR1 a 0 {{{name.upper()}}}\n")
+    found = plant_from_mapping(plant).coefficients.taylor(np.array([3.0]), 0)
+    assert found.u.ravel() == 2
+    assert -1 / found.A[0, 0, 0, 0] == 0.25
+
+
+def test_what_continues_and_what_is_a_comment():
+    netlist = read_netlist("title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n")
     assert [(e.name, e.value) for e in netlist.elements.values()] == [("C1", 1.0), ("R1", 5.0)]
 
 
@@ -405,25 +440,6 @@ def test_nodes_may_be_called_anything(words):
     ("= R1 a 0 1", "= needs a name before it"), (".param\nR1 a 0 1", ".param needs name=value"),
     (".subckt s a b\n.subckt r a b", ".subckt inside .subckt s"),
     (".subckt s", "needs a name and nodes"), (".ends", ".ends without .subckt"),
-@given(digits=st.integers(1, 99), suffix=st.sampled_from("kmunpx"), behind=st.integers(0, 9))
-@settings(max_examples=20, deadline=None)
-def test_digits_behind_a_suffix_are_not_put_behind_the_number(digits, suffix, behind):
-    """4k7 is 4.7k to some, and was 4000.07 here."""
-    word = f"{digits}{suffix}{behind}"
-    for value in (word, f"{{2*{word}}}"):
-        with refused(f"line 2: R1: {word} is no number"):
-            from_netlist(f"t\nR1 a 0 {value}\n")
-
-
-@given(name=st.sampled_from(["t", "T", "time", "d", "step", "pi", "lambda", "r", "v1"]))
-@settings(max_examples=9, deadline=None)
-def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
-    plant = plant_of(f"t\n.param {name}=0.25\nV1 a 0 {{8*{name}}}\nR1 a 0 {{{name.upper()}}}\n")
-    found = plant_from_mapping(plant).coefficients.taylor(np.array([3.0]), 0)
-    assert found.u.ravel() == 2
-    assert -1 / found.A[0, 0, 0, 0] == 0.25
-
-
     (".subckt s a b\nR1 a b 1", ".subckt s has no .ends"),
     (".subckt s a b\nR1 a b 1\n.ends\nX1 a s", "X1 has 1 nodes and the subcircuit s has 2"),
     (".subckt s a r=1\nR1 a 0 {r}\n.ends\nX1 a s rr=2", "s has no parameter rr; did you mean r"),

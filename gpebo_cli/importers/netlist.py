@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import keyword
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,6 +24,7 @@ GROUND = "0"
 MAX_LINES = 20_000
 MAX_ELEMENTS = 5_000  # with those of subcircuits
 MAX_DEPTH = 20  # of subcircuits in subcircuits
+_GROUP = 100  # terms of a sum
 
 NODES = {"R": 2, "L": 2, "C": 2, "V": 2, "I": 2, "E": 4, "G": 4, "F": 2, "H": 2, "S": 2, "T": 4}
 """Kinds of elements with the number of their nodes; K couples two inductors and has none."""
@@ -532,7 +532,7 @@ def _pulse(numbers: Sequence[float]) -> str:
         )
     if count > 1_000:
         raise ValueError(f"has {count:g} pulses; at most 1000 are read")
-    times, values = [0.0], [low]
+    times, values = list[float](), list[float]()
     for k in range(int(count) or 1):
         start = delay + k * period
         times += [start, start + rise, start + rise + width, start + rise + width + fall]
@@ -543,17 +543,20 @@ def _pulse(numbers: Sequence[float]) -> str:
 
 
 def _corners(times: Sequence[float], values: Sequence[float]) -> str:
-    """A piecewise linear function as a sum of ramps and jumps, constant outside."""
-    terms, slope = [repr(values[0])], 0.0
-    points = [*zip(times, values, strict=True), (math.inf, values[-1])]
+    """A piecewise linear function, constant outside: what it is on each piece, on that piece only.
+
+    A sum of ramps would lose digits behind each steep one. Terms stand in groups, because Python's
+    parser nests them.
+    """
+    terms, points = [repr(values[0])], [*zip(times, values, strict=True)]
     for (t, value), (until, end) in itertools.pairwise(points):
-        jump, new = (0.0, (end - value) / (until - t)) if until > t else (end - value, 0.0)
-        if new != slope:
-            terms.append(f"{new - slope!r}*(t - {t!r})*step(t - {t!r})")
-        if jump:
-            terms.append(f"{jump!r}*step(t - {t!r})")
-        slope = new
-    return " + ".join(terms)
+        if until > t and (end != value or value != values[0]):
+            slope = f" + {(end - value) / (until - t)!r}*(t - {t!r})" if end != value else ""
+            terms.append(f"({value - values[0]!r}{slope})*(step(t - {t!r}) - step(t - {until!r}))")
+    if values[-1] != values[0]:
+        terms.append(f"{values[-1] - values[0]!r}*step(t - {times[-1]!r})")
+    groups = [" + ".join(terms[k : k + _GROUP]) for k in range(0, len(terms), _GROUP)]
+    return groups[0] if len(groups) == 1 else f"({') + ('.join(groups)})"
 
 
 _SHAPES = {"sin": _sin, "exp": _exp, "pwl": _pwl, "pulse": _pulse}
