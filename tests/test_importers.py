@@ -590,6 +590,10 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"inputs": ["u"]}, "inputs: expected a mapping of names"),
     ({"K": 3}, "K: expected a list"), ({"K": [1, 2]}, "K[0]: expected a list"),
     ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
+    ({"B": None}, "B has 0 rows; expected 2"), ({"F": []}, "F has 0 rows; expected 2"),
+    *(({"positions": ["q1", name], "r": [1]}, f"{name} is the name of two things; velocities are")
+      for name in ("q1", "v_q1", "lambda1", "r1", "force", "load")),
+    ({"inputs": {"r1": "sin(t)"}, "r": ["cos(t)"]}, "r1 is the name of two things"),
 ])
 def test_mistakes_in_mechanics(change, message):
     with refused(message):

@@ -91,7 +91,7 @@ class PlantDraft:
         self.outputs.clear()
         for matrix in "CDH":
             self._terms[matrix].clear()
-        for row, name in enumerate(names):
+        for row, name in enumerate(dict.fromkeys(names)):
             if name not in self.states:
                 raise ConfigError(
                     f"{where}measure has {shown(name)}, which is no state"
