@@ -17,7 +17,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
-from gpebo_cli.model.archive import MAX_BYTES, read_archive, read_mat
+from gpebo_cli.model.archive import MATRICES, MAX_BYTES, read_archive, read_mat
 from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.model.functions import names_of
 from gpebo_cli.reading import open_regular, read_text
@@ -35,26 +35,29 @@ def from_matrices(
     outputs: Sequence[str] | None = None, initial_state: Sequence[float] | None = None,
     title: str = "", reference: str = "",
 ) -> PlantDraft:
-    """E x' = A x + B u, y = C x + D u with constant matrices.
+    """E x' = A x + B u + F θ, y = C x + D u + H θ with constant matrices.
 
-    The matrices are A (n, n), and E (n, n; default: identity), B (n, m), C (r, n), D (r, m), dense
-    or sparse. There are n states (default x1, x2, …) from ``initial_state`` (n,) or zeros, m inputs
-    with their signals, or names alone (their signals are 0; default u1, …), and r outputs (default
-    y1, …).
+    The matrices are A (n, n), and E (n, n; default: identity), B (n, m), F (n, q), C (r, n),
+    D (r, m), H (r, q), dense or sparse. There are n states (default x1, x2, …) from
+    ``initial_state`` (n,) or zeros, m inputs with their signals, or names alone (their signals are
+    0; default u1, …), r outputs (default y1, …), and q unknowns theta1, … whose truth is 0.
 
     Raises:
         ConfigError: A is missing, sizes that do not fit (says both), or entries that are not real.
     """
-    present = [key for key in _NAMES if matrices.get(key) is not None]
+    present = [key for key in MATRICES if matrices.get(key) is not None]
     given = {key: _real(key, matrices[key], name) for key in present}
     if "A" not in given:
         raise ConfigError(f"plant {name}: the matrix A is missing")
     n = given["A"].shape[0]
     if n > MAX_STATES:
         raise ConfigError(f"plant {name}: A has {n} states; at most {MAX_STATES} are read")
-    m = given["B"].shape[1] if "B" in given else 0
-    r = given["C"].shape[0] if "C" in given else 0
-    sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "C": (r, n), "D": (r, m)}
+    m, q, r = (
+        next((given[key].shape[axis] for key in keys if key in given), 0)
+        for axis, keys in ((1, "BD"), (1, "FH"), (0, "CDH"))
+    )
+    sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "D": (r, m),
+             "H": (r, q)}
     for key, matrix in given.items():
         if matrix.shape != sizes[key]:
             got, expected = (" × ".join(map(str, size)) for size in (matrix.shape, sizes[key]))
@@ -75,6 +78,7 @@ def from_matrices(
         draft.add_matrix(key, matrix)
     return draft
 
+    draft.unknowns.update({f"theta{j + 1}": (0.0, "") for j in range(q)})
 
 def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
     """A state-space model of python-control or SciPy, or anything with A, B, C, D (and E).
