@@ -676,6 +676,41 @@ def test_what_is_not_installed_is_named(package, monkeypatch):
         getattr(result, f"to_{package}")()
 
 
+def test_names_of_models_from_elsewhere_become_names_of_a_plant():
+    """An output is often called as the state that it is; t is time here, and d a derivative."""
+    system = SimpleNamespace(
+        A=A, B=B, C=C, D=np.zeros((1, 1)), state_labels=["theta", "t"], input_labels=["d"],
+        output_labels=["theta"],
+    )
+    plant = from_control(system, "arm", initial_state=[1, 0]).mapping()
+    names = [plant["states"], [*plant["inputs"]], plant["outputs"]]
+    assert names == [["theta", "x_t"], ["u_d"], ["y_theta"]]
+    np.testing.assert_array_equal(simulated(plant)["y_theta"], simulated(plant)["theta"])
+
+
+@given(kept=st.sets(st.sampled_from("BFCDH")), n=st.integers(1, 3))
+@settings(max_examples=10, deadline=None)
+@example(kept=set("DH"), n=2)
+def test_an_archive_is_read_whatever_it_has(kept, n, tmp_path_factory):
+    path = tmp_path_factory.mktemp("archive") / "plant.NPZ"
+    sizes = {"B": (n, 2), "F": (n, 1), "C": (3, n), "D": (3, 2), "H": (3, 1)}
+    given = {"A": -np.eye(n)} | {key: np.full(sizes[key], 2.0) for key in kept}
+    with path.open("wb") as file:
+        np.savez(file, **given)
+    system = plant_from_mapping(from_file(path, "p").mapping())
+    c = system.coefficients.taylor(np.zeros(1), 0)
+    for key, value in given.items():
+        np.testing.assert_array_equal(getattr(c, key)[0, 0], value)
+
+
+def test_what_is_measured_twice_is_an_output_once():
+    draft = from_matrices({"A": -np.eye(3)}, "p")
+    draft.measure(["x2", "x2", "x3"], "")
+    assert (draft.mapping()["outputs"], draft.mapping()["C"]) == (
+        ["y_x2", "y_x3"], [[0, 1, 0], [0, 0, 1]]
+    )
+
+
 def test_files_of_matrices(tmp_path):
     E = sparse.diags([1.0, 2.0])
     savemat(tmp_path / "a.mat", {"E": E, "A": A, "B": B, "C": C})
@@ -748,6 +783,24 @@ def test_mistakes_in_folders_of_matrices(files, message, tmp_path):
         (tmp_path / name).write_text(content)
     with pytest.raises(ConfigError, match=message):
         from_file(tmp_path, "p")
+
+
+@pytest.mark.parametrize("line", [
+    "E = [2, 0; 0, 1]", "x0 = [1; 2]", "B = [1; 0]; % force", "C = [1, 0]  # position",
+])
+@pytest.mark.parametrize("behind", ["", "'", " * 2", ";;"])
+def test_a_line_of_a_linear_model_is_read_or_refused(line, behind, tmp_path):
+    """It was left out where something stood behind it."""
+    path, word = tmp_path / "m.m", line.split()[0]
+    line = line.replace("]", f"]{behind}", 1)
+    path.write_text(f"A = [0, 1; -2, -0.3];\n{line}\nD = zeros(0,0);\n")
+    if behind:
+        with refused(f"m.m: {word} is not read; expected numbers in brackets, or zeros"):
+            from_file(path, "p")
+    else:
+        plant = from_file(path, "p").mapping()
+        assert [*plant["initial_state"].values()] == ([1, 2] if word == "x0" else [0, 0])
+        assert word == "x0" or plant[word][0][0] in (1, 2)
 
 
 @pytest.mark.parametrize(("matrix", "message"), [
