@@ -137,6 +137,43 @@ def test_every_remedy_is_exact_along_signals(name, horizon, remedy, estimator):
     assert (np.abs(of_theta) < 1e-6 * np.abs(found.system.theta)).all()
 
 
+@pytest.mark.parametrize("followed", ["0", "y"])
+@pytest.mark.parametrize("what", [
+    "sign(@ + 0.38)", "sign(abs(@) - 0.38)", "max(@, -0.38)", "0.9*min(@, 0.2)*sign(@ - 0.1)",
+])
+def test_what_switches_by_an_input_is_as_exact_as_its_text_in_time(what, followed):
+    """Where an element ends with a jump, rounding of the input decided on which side that was."""
+    text, found = "(1.2*cos(0.91*t))", []
+    for name in (text, "u"):
+        entry = what.replace("@", name)
+        found.append(run({
+            "name": "relay", "states": ["x", "v"], "unknowns": {"load": 0.7}, "outputs": ["y"],
+            "inputs": {"u": text}, "E": [[1, 0], [0, 1]], "B": [[followed], [0]], "C": [[1, 0]],
+            "A": [[-1.5, f"0.9*({entry})"], [0.4, f"-1 - {followed}**2"]], "phi": [entry, 0],
+            "F": [[1], [0]], "initial_state": [-0.4, 1],
+        }, estimator="ls_drem", time={"horizon": 4.0, "samples": 41}))
+    ours, theirs = found
+    for name in ("x", "v"):
+        np.testing.assert_allclose(ours[name], theirs[name], atol=1e-12)
+    np.testing.assert_allclose(ours.estimates["load"], theirs.estimates["load"], atol=1e-10)
+    elements = [each.details.simulation.elements for each in found]
+    assert elements[1] <= elements[0] + 4
+
+
+def test_a_kink_of_an_input_in_a_constraint_is_passed_where_an_output_is_followed():
+    text = "(1.2*cos(0.91*t))"
+    found = [
+        run({
+            "name": "kink", "states": ["x", "z", "w"], "outputs": ["y"], "inputs": {"u": text},
+            "E": [[1, 0, 0], [0, 0, 0], [0, 0, 1]], "B": [[0], [0], ["0.5*y"]], "C": [[0, 0, 1]],
+            "A": [[0, 1, 0], [1, 0, 0], [0, 1, "-1 - 0.3*y**2"]],
+            "phi": [0, f"-0.1*abs({name} + 0.38)", 0], "initial_state": [0, 0, 1],
+        }, observer="none", time={"horizon": 4.0, "samples": 41}) for name in (text, "u")
+    ]
+    for name in "xzw":
+        np.testing.assert_allclose(found[1][name], found[0][name], atol=1e-9)
+
+
 def test_the_kalman_bucy_filter_is_that_of_the_linear_plant_along_the_signals():
     """The same estimates as for a plant whose A and F are those functions of time."""
     system, signals = signals_of("lorenz", 2.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -208,6 +209,36 @@ def test_plants_with_many_switching_inputs_are_as_wrong_as_they_say(seed):
     assert (wrong < 3.0 * result.state_errors).all()
     assert result.error_estimate < 1e-8
     assert result.signals.mesh.size <= len(result.jumps) + 25 * len(inputs)
+
+
+@pytest.mark.parametrize(("text", "function"), [
+    ("max(sign(cos(7*t)), 0.4*sin(t))", lambda s, t: np.maximum(s, 0.4 * np.sin(t))),
+    ("min(sign(cos(7*t)), 0.3 + 0.1*t)", lambda s, t: np.minimum(s, 0.3 + 0.1 * t)),
+    ("abs(sign(cos(7*t)) + 2*sin(t))", lambda s, t: np.abs(s + 2 * np.sin(t))),
+])
+def test_a_jump_within_what_switches_is_no_rounding_of_it(text, function):
+    """Its instant was said to be vague by as long as it takes to level such a jump."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x"], "inputs": {"u": text}, "E": [[1]], "A": [[0]], "B": [[1]],
+        "initial_state": [0],
+    })
+    result = simulate(system, TimeSettings(horizon=4.0), SolverSettings())
+    cuts = np.concatenate([[0.0], found(text, 0.0, 4.0), [4.0]])
+    x, weights = np.polynomial.legendre.leggauss(40)
+    whole = 0.0
+    for a, b in pairwise(cuts):
+        t = 0.5 * (a + b) + 0.5 * (b - a) * x
+        whole += 0.5 * (b - a) * (weights @ function(np.sign(np.cos(3.5 * (a + b))), t))
+    assert abs(result.signals.states.final[0] - whole) < 1e-13
+    assert result.error_estimate < 1e-12
+
+
+@pytest.mark.parametrize(("text", "whole"), [
+    ("sign(max(0, sin(t)))", 3 * np.pi), ("abs(max(0, sin(t)))", 6.0),
+    ("max(0, max(0, sin(t)))", 6.0), ("sign(asin(sin(t))*step(t - 2*pi))", np.pi),
+])
+def test_what_is_zero_for_a_while_switches_nothing_then(text, whole):
+    assert integrated(text, horizon=5 * np.pi) == pytest.approx(whole, rel=1e-12)
 
 
 def test_falling_arguments_switch_the_right_way():

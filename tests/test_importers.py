@@ -32,6 +32,7 @@ from gpebo_cli.importers import from_control, from_file, from_matrices, from_mec
 from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.mechanics import linearise
 from gpebo_cli.importers.netlist import number, read_netlist
+from gpebo_cli.model.expressions import parse
 from gpebo_cli.model.plant import plant_from_mapping
 
 PAPER = """electrical circuit of the paper
@@ -262,6 +263,21 @@ def test_sources_are_those_of_spice(source, expected):
     np.testing.assert_allclose(u, expected(t), rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("edge", [0.0, 1e-9, 1e-4])
+def test_steep_edges_of_pulses_leave_all_digits(edge):
+    """Some pulses are over at t = 0."""
+    plant = plant_of(f"t\nV1 a 0 PULSE(1 6 -3m {edge} {edge} 0.3m 1m 9)\nR1 a 0 1\n")
+    starts = 1e-3 * np.arange(6)
+    for away, value in ((1.7e-4, 6), (7e-4, 1)):
+        found = plant_from_mapping(plant).coefficients.taylor(starts + away, 0).u
+        np.testing.assert_allclose(found.ravel(), value, rtol=1e-15)
+
+
+def test_as_many_pulses_are_read_as_is_said():
+    text = from_netlist("t\nV1 a 0 PULSE(0 1 0 1n 1n 0.3m 1m 1000)\nR1 a 0 1\n").inputs["V1"][0]
+    assert parse(text, {}, "V1").text.count("step") == 6000
+
+
 def test_coupled_coils_are_three_that_are_not():
     coils = "t\nV1 in 0 SIN(0 1 0.3)\nR1 in a 1\nR2 b 0 3\n"
     M = 0.5 * np.sqrt(2)
@@ -345,6 +361,21 @@ def test_what_is_controlled_may_determine_a_loop_or_a_cutset(text, measure, valu
     assert simulated(plant)[plant["outputs"][0]][-1] == pytest.approx(value, rel=1e-12)
 
 
+@given(words=st.permutations(
+    ["/in", "net-(r1-pad1)", "1.2", "n$1", "out+", "in", "vin", "a_b", "a-b"]
+))
+@settings(max_examples=5, deadline=None)
+def test_nodes_may_be_called_anything(words):
+    """A chain of resistors with 9 V across nine of them, and a source that is called as a node."""
+    chain = "\n".join(f"R{k} {a} {b} 1" for k, (a, b) in enumerate(pairwise([*words, "0"])))
+    text = f"t\nvin {words[0]} 0 9\n{chain}\nC1 {words[-1]} 0 1\n.ic v({words[-1]})=2\n"
+    plant = plant_of(text, measure=[f"v({word.upper()})" for word in words], unknown="VIN")
+    assert list(plant["initial_state"].values()).count(2.0) == 1
+    assert len(plant["unknowns"]) == 1
+    result = simulated(plant, 40.0)
+    np.testing.assert_allclose([result[y][-1] for y in plant["outputs"]], range(9, 0, -1))
+
+
 def test_an_unknown_source_is_estimated():
     text = "leak\nV1 a 0 SIN(0 1 0.5)\nR1 a b 1k\nC1 b 0 1m ic=0.2\nI5 b 0 2u\n"
     result = run(plant_of(text, measure="v(b)", unknown="I5"), estimator="ls_drem")
@@ -353,10 +384,29 @@ def test_an_unknown_source_is_estimated():
 
 @pytest.mark.parametrize(("text", "value"), [
     ("4.7k", 4700.0), ("10uF", 1e-5), ("1meg", 1e6), ("1MEG", 1e6), ("2m", 2e-3), ("1e-3", 1e-3),
-    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10),
+    ("5V", 5.0), ("3mil", 76.2e-6), (".5n", 5e-10), ("2\u00b5F", 2e-6), ("2\u03bc", 2e-6),
 ])
 def test_suffixes(text, value):
     assert number(text) == pytest.approx(value, rel=1e-15)
+
+
+@given(digits=st.integers(1, 99), suffix=st.sampled_from("kmunpx"), behind=st.integers(0, 9))
+@settings(max_examples=20, deadline=None)
+def test_digits_behind_a_suffix_are_not_put_behind_the_number(digits, suffix, behind):
+    """4k7 is 4.7k to some, and was 4000.07 here."""
+    word = f"{digits}{suffix}{behind}"
+    for value in (word, f"{{2*{word}}}"):
+        with refused(f"line 2: R1: {word} is no number"):
+            from_netlist(f"t\nR1 a 0 {value}\n")
+
+
+@given(name=st.sampled_from(["t", "T", "time", "d", "step", "pi", "lambda", "r", "v1"]))
+@settings(max_examples=9, deadline=None)
+def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
+    plant = plant_of(f"t\n.param {name}=0.25\nV1 a 0 {{8*{name}}}\nR1 a 0 {{{name.upper()}}}\n")
+    found = plant_from_mapping(plant).coefficients.taylor(np.array([3.0]), 0)
+    assert found.u.ravel() == 2
+    assert -1 / found.A[0, 0, 0, 0] == 0.25
 
 
 def test_what_continues_and_what_is_a_comment():
@@ -394,7 +444,11 @@ def test_what_continues_and_what_is_a_comment():
     (".subckt s a b\nR1 a b 1\n.ends\nX1 a s", "X1 has 1 nodes and the subcircuit s has 2"),
     (".subckt s a r=1\nR1 a 0 {r}\n.ends\nX1 a s rr=2", "s has no parameter rr; did you mean r"),
     (".model d d\nR1 a 0 1", ".model is not read"),
-    ("K1 L1 L2", "two inductors and a coefficient"),
+    ("K1 L1 L2", "two inductors and a coefficient"), ("K1 L1 l1 1", "K1 needs two inductors"),
+    (".global vdd", "line 2: .global is not read; give each subcircuit a node"),
+    (".subckt s gnd\nR1 gnd 0 1\n.ends\nX1 a s\nV1 a 0 1", "X1: ground, a node of"),
+    (".subckt s a\nR1 a m 1\nC1 m 0 1\n.ends\nX1 b s\nR1 b x1_m 1", "line 7: the node x1_m and"),
+    (".subckt s a\nR1 a m 1\nR2 m 0 1\n.ends\nX2 x1_m s\nX1 x1_m s", "line 3: the node m and one"),
     ("R1 a 0 1 ic=2", "R1: ic= is not read here"), ("R1 a 0 1 tc1=2", "tc1= changes the value"),
     ("T1 a 0 b 0 2", "T1 needs n=RATIO"), ("F1 a 0", "needs the voltage source whose current"),
     ("S1 a 0", "S1 needs its instants"), ("S1 a 0 on=x", "on=x has to be times in seconds"),
@@ -536,6 +590,10 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"inputs": ["u"]}, "inputs: expected a mapping of names"),
     ({"K": 3}, "K: expected a list"), ({"K": [1, 2]}, "K[0]: expected a list"),
     ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
+    ({"B": None}, "B has 0 rows; expected 2"), ({"F": []}, "F has 0 rows; expected 2"),
+    *(({"positions": ["q1", name], "r": [1]}, f"{name} is the name of two things; velocities are")
+      for name in ("q1", "v_q1", "lambda1", "r1", "force", "load")),
+    ({"inputs": {"r1": "sin(t)"}, "r": ["cos(t)"]}, "r1 is the name of two things"),
 ])
 def test_mistakes_in_mechanics(change, message):
     with refused(message):
@@ -618,6 +676,41 @@ def test_what_is_not_installed_is_named(package, monkeypatch):
         getattr(result, f"to_{package}")()
 
 
+def test_names_of_models_from_elsewhere_become_names_of_a_plant():
+    """An output is often called as the state that it is; t is time here, and d a derivative."""
+    system = SimpleNamespace(
+        A=A, B=B, C=C, D=np.zeros((1, 1)), state_labels=["theta", "t"], input_labels=["d"],
+        output_labels=["theta"],
+    )
+    plant = from_control(system, "arm", initial_state=[1, 0]).mapping()
+    names = [plant["states"], [*plant["inputs"]], plant["outputs"]]
+    assert names == [["theta", "x_t"], ["u_d"], ["y_theta"]]
+    np.testing.assert_array_equal(simulated(plant)["y_theta"], simulated(plant)["theta"])
+
+
+@given(kept=st.sets(st.sampled_from("BFCDH")), n=st.integers(1, 3))
+@settings(max_examples=10, deadline=None)
+@example(kept=set("DH"), n=2)
+def test_an_archive_is_read_whatever_it_has(kept, n, tmp_path_factory):
+    path = tmp_path_factory.mktemp("archive") / "plant.NPZ"
+    sizes = {"B": (n, 2), "F": (n, 1), "C": (3, n), "D": (3, 2), "H": (3, 1)}
+    given = {"A": -np.eye(n)} | {key: np.full(sizes[key], 2.0) for key in kept}
+    with path.open("wb") as file:
+        np.savez(file, **given)
+    system = plant_from_mapping(from_file(path, "p").mapping())
+    c = system.coefficients.taylor(np.zeros(1), 0)
+    for key, value in given.items():
+        np.testing.assert_array_equal(getattr(c, key)[0, 0], value)
+
+
+def test_what_is_measured_twice_is_an_output_once():
+    draft = from_matrices({"A": -np.eye(3)}, "p")
+    draft.measure(["x2", "x2", "x3"], "")
+    assert (draft.mapping()["outputs"], draft.mapping()["C"]) == (
+        ["y_x2", "y_x3"], [[0, 1, 0], [0, 0, 1]]
+    )
+
+
 def test_files_of_matrices(tmp_path):
     E = sparse.diags([1.0, 2.0])
     savemat(tmp_path / "a.mat", {"E": E, "A": A, "B": B, "C": C})
@@ -690,6 +783,24 @@ def test_mistakes_in_folders_of_matrices(files, message, tmp_path):
         (tmp_path / name).write_text(content)
     with pytest.raises(ConfigError, match=message):
         from_file(tmp_path, "p")
+
+
+@pytest.mark.parametrize("line", [
+    "E = [2, 0; 0, 1]", "x0 = [1; 2]", "B = [1; 0]; % force", "C = [1, 0]  # position",
+])
+@pytest.mark.parametrize("behind", ["", "'", " * 2", ";;"])
+def test_a_line_of_a_linear_model_is_read_or_refused(line, behind, tmp_path):
+    """It was left out where something stood behind it."""
+    path, word = tmp_path / "m.m", line.split()[0]
+    line = line.replace("]", f"]{behind}", 1)
+    path.write_text(f"A = [0, 1; -2, -0.3];\n{line}\nD = zeros(0,0);\n")
+    if behind:
+        with refused(f"m.m: {word} is not read; expected numbers in brackets, or zeros"):
+            from_file(path, "p")
+    else:
+        plant = from_file(path, "p").mapping()
+        assert [*plant["initial_state"].values()] == ([1, 2] if word == "x0" else [0, 0])
+        assert word == "x0" or plant[word][0][0] in (1, 2)
 
 
 @pytest.mark.parametrize(("matrix", "message"), [

@@ -286,10 +286,10 @@ def test_the_linearisation_is_the_derivative():
 
 def test_signals_are_taken_at_the_time_itself_but_where_something_switches():
     """At ends of elements they were a little aside: an error of 1e-9 of an element's change."""
-    plant = plant_from_mapping({
+    plant, relay = (plant_from_mapping({
         "name": "kinked", "states": ["x"], "inputs": {"u": "exp(3*t)"}, "outputs": ["y"],
-        "E": [[1]], "A": [["-abs(y)"]], "phi": ["u"], "C": [[1]], "initial_state": [-1.0],
-    })
+        "E": [[1]], "A": [[entry]], "phi": ["u"], "C": [[1]], "initial_state": [-1.0],
+    }) for entry in ("-abs(y)", "-sign(y)"))
     found = simulate(plant, TimeSettings(horizon=2.0), SOLVER).signals
     linear, mesh = Linearised(plant, found.states), found.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
@@ -301,8 +301,10 @@ def test_signals_are_taken_at_the_time_itself_but_where_something_switches():
     right = c.A[0, :, 0, 0] * x + c.phi[0, :, 0]
     exact = np.exp(3 * t) - np.abs(x) * x
     np.testing.assert_allclose(right[~passed], exact[~passed], rtol=1e-13)
-    seen = Measurements(found.inputs, found.outputs).at(t, inside, plant)
+    seen, at = (Measurements(found.inputs, found.outputs).at(t, inside, each)
+                for each in (relay, plant))
     np.testing.assert_allclose(seen[~passed, 0], np.exp(3 * t[~passed]), rtol=1e-13)
+    np.testing.assert_allclose(at[:, 0], np.exp(3 * t), rtol=1e-13)  # |y| is continuous
     side = np.sign(seen[passed, 1])
     assert (side == np.sign(inside[passed] - linear.switched)).all()
 

@@ -17,6 +17,7 @@ from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.importers.matrices import from_control, from_matrices, read_matrices
 from gpebo_cli.importers.mechanics import from_mechanics
 from gpebo_cli.importers.netlist import split_names
+from gpebo_cli.model.archive import MATRICES
 from gpebo_cli.reading import read_text
 
 __all__ = [
@@ -81,7 +82,7 @@ def from_file(
         draft = from_mechanics(content, name, str(path))
     else:
         found: dict[str, Any] = read_matrices(file)
-        matrices = {key: found.pop(key) for key in "EABCD" if key in found}
+        matrices = {key: found.pop(key) for key in MATRICES if key in found}
         draft = from_matrices(matrices, name, reference=str(path), **found)
     if measure is not None:
         draft.measure(split_names(measure), f"{path}: ")

@@ -23,10 +23,11 @@ from gpebo_cli.schema import nearest, shown
 
 _NO_NAMES = {*RESERVED, *keyword.kwlist}
 _WITH_CURRENT = "LVEHT"  # kinds whose current is an unknown
-_QUANTITY = re.compile(r"([vi])\((\w+)(?:,(\w+))?\)", re.IGNORECASE)
+_QUANTITY = re.compile(r"([vi])\(([^,]+?)(?:,([^,]+))?\)", re.IGNORECASE)
 _ORDER = "CLKRSVEHTIGF"  # of the kinds in a plant: what is differentiated first, what drives last
 _TERM = re.compile(
-    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?([vi]\([\w,]+\))", re.IGNORECASE
+    r"([+-]?)(?:((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\*)?"
+    r"([vi]\((?:[^()]|\([^()]*\))+\))", re.IGNORECASE
 )
 
 
@@ -42,8 +43,7 @@ def circuit_from_netlist(
     draft = builder.build()
     for output in measured or [q for q in netlist.saved if q.startswith("v(")]:
         builder.output(output)
-    sources = {name: e.name for name, e in builder.elements.items()}
-    draft.make_unknown(sources.get(word.lower(), word) for word in split_names(unknown))
+    draft.make_unknown(builder.called.get(word.lower(), word) for word in split_names(unknown))
     draft.comments.append(topology)
     return draft
 
@@ -162,7 +162,7 @@ class _Builder:
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self._taken: set[str] = set()
         self._turned: set[int] = set()  # rows that are multiplied by −1
-        self._called: dict[str, str] = {}  # parameter of an element's value, by lower-case name
+        self.called: dict[str, str] = {}  # parameter or input of an element, by lower-case name
         self._node: dict[str, str] = {}  # state of a node's voltage
         self._row: dict[str, int] = {}  # of a node's balance of currents
         self._current: dict[str, str] = {}  # state of an element's current, by lower-case name
@@ -180,8 +180,9 @@ class _Builder:
             draft.parameters[self._claim(key, key)] = value
         nodes = {node for e in self.elements.values() for node in e.nodes} - {GROUND}
         for node in sorted(nodes, key=_natural):
-            plain = node.isidentifier() and node not in _NO_NAMES
-            label = self._claim(node if plain else f"v{node}", f"v_{node}")
+            word = re.sub(r"\W", "_", node, flags=re.ASCII)
+            plain = word == node and not word[0].isdigit() and word not in _NO_NAMES
+            label = self._claim(word if plain else f"v{word}", f"v_{word}")
             self._node[node] = label
             self._row[node] = draft.equation(f"currents at node {node}")
             draft.states[label] = (self.netlist.initial.get(f"v({node})", 0.0), "V")
@@ -264,7 +265,7 @@ class _Builder:
 
     def _value(self, e: Element) -> str:
         """A parameter that stands for the element's value."""
-        name = self._called[e.name.lower()] = self._claim(e.name, f"{e.name}_")
+        name = self.called[e.name.lower()] = self._claim(e.name, f"{e.name}_")
         self.draft.parameters[name] = e.value
         return name
 
@@ -330,7 +331,7 @@ class _Builder:
                 raise e.place.error(f"{e.name} couples {name}, which is no inductor")
         value, (first, second) = self._value(e), e.controls
         mutual = self._claim(f"M_{e.name}", f"M_{e.name}_")
-        own, other = self._called[first], self._called[second]
+        own, other = self.called[first], self.called[second]
         self.draft.parameters[mutual] = f"{value}*sqrt({own}*{other})"
         for coil, by in ((first, second), (second, first)):
             self._change_of_flux(self._row[f"coil {coil}"], self._current[by], mutual)
@@ -375,7 +376,7 @@ class _Builder:
         return row, column
 
     def _input(self, e: Element, unit: str) -> str:
-        name = self._claim(e.name, f"{e.name}_source")
+        name = self.called[e.name.lower()] = self._claim(e.name, f"{e.name}_source")
         self.draft.inputs[name] = (e.value, unit)
         return name
 
@@ -416,7 +417,7 @@ class _Builder:
         if not found:
             return
         known = read_parameters(f"circuit {self.draft.name}", parameters, {}, {})
-        tape = record([known[self._called[e.name.lower()]] for e in found])
+        tape = record([known[self.called[e.name.lower()]] for e in found])
         for e, value in zip(found, tape.taylor(np.zeros(1), 0)[0, 0], strict=True):
             first, second = (
                 float(states[self._node[node]][0]) if node != GROUND else 0.0 for node in e.nodes

@@ -91,7 +91,7 @@ class PlantDraft:
         self.outputs.clear()
         for matrix in "CDH":
             self._terms[matrix].clear()
-        for row, name in enumerate(names):
+        for row, name in enumerate(dict.fromkeys(names)):
             if name not in self.states:
                 raise ConfigError(
                     f"{where}measure has {shown(name)}, which is no state"
@@ -270,7 +270,7 @@ def _sum(terms: list[Entry]) -> Entry:
     number = sum(term for term in terms if not isinstance(term, str))
     text = [term for term in terms if isinstance(term, str)]
     if not text:
-        return int(number) if number == int(number) and abs(number) < 1e15 else number
+        return int(number) if abs(number) < 1e15 and number == int(number) else number
     if number:
         text.insert(0, repr(float(number)))
     out = text[0]
@@ -281,7 +281,7 @@ def _sum(terms: list[Entry]) -> Entry:
 
 def _scalar(value: object) -> str:
     """One value as YAML writes it inside a list."""
-    if isinstance(value, float) and value == int(value) and abs(value) < 1e15:
+    if isinstance(value, float) and abs(value) < 1e15 and value == int(value):
         value = int(value)
     written = yaml.safe_dump([value], default_flow_style=True, width=10**9, allow_unicode=True)
     return written.strip()[1:-1]

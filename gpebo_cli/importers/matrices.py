@@ -17,8 +17,9 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
-from gpebo_cli.model.archive import MAX_BYTES, read_archive, read_mat
+from gpebo_cli.model.archive import MATRICES, MAX_BYTES, read_archive, read_mat
 from gpebo_cli.model.entries import is_sparse
+from gpebo_cli.model.expressions import RESERVED
 from gpebo_cli.model.functions import names_of
 from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown
@@ -27,6 +28,12 @@ MAX_STATES = 2_000
 _MAX_TEXT = 20_000_000  # bytes of a linearisation
 
 _NAMES = "EABCD"
+_KINDS = {"state": "x", "input": "u", "output": "y"}  # and what begins a name that is taken
+_VARIABLES = {"stateVars": "states", "inputVars": "inputs", "outputVars": "outputs"}
+_ASSIGNED = re.compile(rf"(?m)^\s*(?:local\s+)?([{_NAMES}]|x0|{'|'.join(_VARIABLES)})\s*=(?!=)\s*")
+_VALUE = re.compile(  # up to the end of a line, on which a comment may stand
+    r"(?ms)(?:np\.array\()?\s*([\[{].*?[\]}])\s*\)?\s*;?[^\S\n]*(?:[%#][^\n]*)?$"
+)
 
 
 def from_matrices(
@@ -35,26 +42,29 @@ def from_matrices(
     outputs: Sequence[str] | None = None, initial_state: Sequence[float] | None = None,
     title: str = "", reference: str = "",
 ) -> PlantDraft:
-    """E x' = A x + B u, y = C x + D u with constant matrices.
+    """E x' = A x + B u + F θ, y = C x + D u + H θ with constant matrices.
 
-    The matrices are A (n, n), and E (n, n; default: identity), B (n, m), C (r, n), D (r, m), dense
-    or sparse. There are n states (default x1, x2, …) from ``initial_state`` (n,) or zeros, m inputs
-    with their signals, or names alone (their signals are 0; default u1, …), and r outputs (default
-    y1, …).
+    The matrices are A (n, n), and E (n, n; default: identity), B (n, m), F (n, q), C (r, n),
+    D (r, m), H (r, q), dense or sparse. There are n states (default x1, x2, …) from
+    ``initial_state`` (n,) or zeros, m inputs with their signals, or names alone (their signals are
+    0; default u1, …), r outputs (default y1, …), and q unknowns theta1, … whose truth is 0.
 
     Raises:
         ConfigError: A is missing, sizes that do not fit (says both), or entries that are not real.
     """
-    present = [key for key in _NAMES if matrices.get(key) is not None]
+    present = [key for key in MATRICES if matrices.get(key) is not None]
     given = {key: _real(key, matrices[key], name) for key in present}
     if "A" not in given:
         raise ConfigError(f"plant {name}: the matrix A is missing")
     n = given["A"].shape[0]
     if n > MAX_STATES:
         raise ConfigError(f"plant {name}: A has {n} states; at most {MAX_STATES} are read")
-    m = given["B"].shape[1] if "B" in given else 0
-    r = given["C"].shape[0] if "C" in given else 0
-    sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "C": (r, n), "D": (r, m)}
+    m, q, r = (
+        next((given[key].shape[axis] for key in keys if key in given), 0)
+        for axis, keys in ((1, "BD"), (1, "FH"), (0, "CDH"))
+    )
+    sizes = {"E": (n, n), "A": (n, n), "B": (n, m), "F": (n, q), "C": (r, n), "D": (r, m),
+             "H": (r, q)}
     for key, matrix in given.items():
         if matrix.shape != sizes[key]:
             got, expected = (" × ".join(map(str, size)) for size in (matrix.shape, sizes[key]))
@@ -68,6 +78,7 @@ def from_matrices(
     signals = inputs if isinstance(inputs, Mapping) else {}
     columns = names_of("inputs", None if inputs is None else list(inputs), "u", m, name)
     draft.inputs.update({u: (signals.get(u, 0.0), "") for u in columns})
+    draft.unknowns.update({f"theta{j + 1}": (0.0, "") for j in range(q)})
     draft.outputs.update(dict.fromkeys(names_of("outputs", outputs, "y", r, name), ""))
     for i in range(n):
         draft.equation(f"equation {i + 1}")
@@ -97,11 +108,8 @@ def from_control(system: Any, name: str, **options: Any) -> PlantDraft:
         kind = type(system).__name__
         raise ConfigError(f"plant {name}: {kind} has no A; give a state-space model")
     matrices = {key: getattr(system, key, None) for key in _NAMES}
-    for kind in ("state", "input", "output"):
-        labels = getattr(system, f"{kind}_labels", None)
-        if labels is not None:
-            options.setdefault(f"{kind}s", [_identifier(str(label)) for label in labels])
-    return from_matrices(matrices, name, **options)
+    labels = {f"{kind}s": getattr(system, f"{kind}_labels", None) for kind in _KINDS}
+    return from_matrices(matrices, name, **{**_identifiers(labels), **options})
 
 
 def read_matrices(path: Path) -> dict[str, Any]:
@@ -114,11 +122,12 @@ def read_matrices(path: Path) -> dict[str, Any]:
     """
     if path.is_dir():
         return _matrix_market(path)
-    if path.suffix == ".mat":
+    ending = path.suffix.lower()
+    if ending == ".mat":
         return _matlab(path)
-    if path.suffix == ".npz":
+    if ending == ".npz":
         return read_archive(str(path))
-    if path.suffix in (".py", ".m", ".jl"):
+    if ending in (".py", ".m", ".jl"):
         return _modelica(path)
     raise ConfigError(
         f"{path}: expected a .mat, .npz, .py, .m or .jl file, or a folder of .mtx files"
@@ -166,25 +175,25 @@ def _modelica(path: Path) -> dict[str, Any]:
     """``A = [1, 2; 3, 4]`` of MATLAB or Julia text, or ``A = [[1, 2], [3, 4]]`` of Python text."""
     text = read_text(path, _MAX_TEXT)
     found: dict[str, Any] = {}
-    assigned = r"^\s*(?:local\s+)?([EABCD])\s*=\s*(?:np\.array\()?\s*(\[.*?\])\s*\)?\s*;?\s*$"
-    for match in re.finditer(assigned, text, re.MULTILINE | re.DOTALL):
-        matrix = _bracketed(match[2], f"{path}: {match[1]}")
-        if matrix.size:  # without inputs, B is []
-            found[match[1]] = matrix
-    names = (("states", "stateVars"), ("inputs", "inputVars"), ("outputs", "outputVars"),
-             ("initial_state", "x0"))
-    for key, word in names:
-        line = re.search(rf"(?ms)^\s*(?:local\s+)?{word}\s*=\s*[\[{{](.*?)[\]}}]\s*;?\s*$", text)
-        if line is None:
-            continue
-        if key == "initial_state":
-            items = re.split(r"[,;\s]+", line[1].strip())
-            found[key] = [_float(item, f"{path}: {word}") for item in items]
+    for match in _ASSIGNED.finditer(text):
+        word, value = match[1], _VALUE.match(text, match.end())
+        where = f"{path}: {word}"
+        if value is None and text.startswith(("zeros(", "np.zeros("), match.end()):
+            continue  # without inputs, B is zeros(2, 0)
+        if value is None:
+            raise ConfigError(f"{where} is not read; expected numbers in brackets, or zeros(…)")
+        if word == "x0":
+            items = re.split(r"[,;\s]+", value[1][1:-1].strip())
+            found["initial_state"] = [_float(item, where) for item in items]
+        elif word in _VARIABLES:
+            found[_VARIABLES[word]] = [x for _, x in re.findall(r"(['\"])(.*?)\1", value[1])]
         else:
-            found[key] = [_identifier(item) for _, item in re.findall(r"(['\"])(.*?)\1", line[1])]
+            matrix = _bracketed(value[1], where)
+            if matrix.size:  # or B is []
+                found[word] = matrix
     if "A" not in found:
         raise ConfigError(f"{path} has no line A = [...]; expected the text of a linear model")
-    return found
+    return found | _identifiers(found)
 
 
 def _bracketed(text: str, where: str) -> np.ndarray[Any, Any]:
@@ -208,10 +217,17 @@ def _float(text: str, where: str) -> float:
         raise ConfigError(f"{where}: {shown(text)} is not a number") from None
 
 
-def _identifier(text: str) -> str:
-    """A name that can stand in a plant: other characters become _."""
-    name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_")
-    return name if name and not name[0].isdigit() else f"x_{name}"
+def _identifiers(labels: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Names that can stand in a plant, each once: other characters become _, and y_x is not x."""
+    taken, found = set(RESERVED), dict[str, list[str]]()
+    for kind, letter in _KINDS.items():
+        for label in labels.get(f"{kind}s") or ():
+            name = re.sub(r"\W+", "_", str(label), flags=re.ASCII).strip("_")
+            while not name or name[0].isdigit() or name in taken:
+                name = f"{letter}_{name}"
+            taken.add(name)
+            found.setdefault(f"{kind}s", []).append(name)
+    return found
 
 
 def _real(key: str, value: Any, plant: str) -> Any:

@@ -67,7 +67,8 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
     sizes = {"M": (k, k), "D": (k, k), "K": (k, k), "G": (c, k), "B": (k, len(given.inputs)),
              "F": (k, len(given.unknowns))}
     M, D, K, G, B, F = (
-        _sized(getattr(given, key), *size, f"{where}: {key}") for key, size in sizes.items()
+        _sized(getattr(given, key), *size, f"{where}: {key}", needed=key in "BF")
+        for key, size in sizes.items()
     )
     positions = given.positions or [f"q{i + 1}" for i in range(k)]
     if len(positions) != k:
@@ -76,6 +77,15 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         raise ConfigError(f"{where}: r has {len(given.r)} entries, and there are {c} constraints")
     velocities = [f"v_{position}" for position in positions]
     forces = [f"lambda{i + 1}" for i in range(c)]
+    # A motion that a constraint follows is an input.
+    followed = {f"r{j + 1}": entry for j, entry in enumerate(given.r) if entry != 0}
+    names = [*positions, *velocities, *forces, *given.inputs, *followed, *given.unknowns]
+    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
+    if twice is not None:
+        raise ConfigError(
+            f"{where}: {twice} is the name of two things; velocities are v_<position>, forces "
+            "lambda1, …, and motions that constraints follow r1, …"
+        )
 
     draft = PlantDraft(
         name, given.title or f"mechanism {name}", given.reference or source,
@@ -99,11 +109,11 @@ def from_mechanics(model: Mapping[str, object], name: str, source: str = "") -> 
         draft.equation(f"{position}' = {velocity}")
     for position in positions:
         draft.equation(f"balance of forces along {position}")
-    for j in range(c):  # 0 = G q − r; an r that is not zero is an input
+    for j in range(c):  # 0 = G q − r
         row = draft.equation(f"constraint {j + 1}: G q = r")
-        if given.r and given.r[j] != 0:
-            draft.inputs[f"r{j + 1}"] = (given.r[j], "")
-            draft.add("B", row, f"r{j + 1}", -1.0)
+        if (name := f"r{j + 1}") in followed:
+            draft.inputs[name] = (followed[name], "")
+            draft.add("B", row, name, -1.0)
     one = np.eye(k)
     draft.add_matrix("E", one, columns=positions)
     draft.add_matrix("A", one, columns=velocities)
@@ -164,9 +174,9 @@ def linearise(
     }
 
 
-def _sized(matrix: Matrix, rows: int, columns: int, where: str) -> Matrix:
-    """A matrix of the size that is asked for, or none."""
-    if matrix and len(matrix) != rows:
+def _sized(matrix: Matrix, rows: int, columns: int, where: str, *, needed: bool) -> Matrix:
+    """A matrix of the size that is asked for, or none if it is not ``needed``."""
+    if (matrix or (needed and columns)) and len(matrix) != rows:
         raise ConfigError(f"{where} has {len(matrix)} rows; expected {rows}")
     for i, row in enumerate(matrix):
         if len(row) != columns:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import itertools
 import keyword
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,20 +24,22 @@ GROUND = "0"
 MAX_LINES = 20_000
 MAX_ELEMENTS = 5_000  # with those of subcircuits
 MAX_DEPTH = 20  # of subcircuits in subcircuits
+_GROUP = 100  # terms of a sum
 
 NODES = {"R": 2, "L": 2, "C": 2, "V": 2, "I": 2, "E": 4, "G": 4, "F": 2, "H": 2, "S": 2, "T": 4}
 """Kinds of elements with the number of their nodes; K couples two inductors and has none."""
 
 _NUMBER = re.compile(
-    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(meg|mil|[tgxkmunpf]?)[a-z]*", re.IGNORECASE
+    r"([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)"
+    r"(meg|mil|[tgxkmu\u00b5\u03bcnpf]?)[a-z]*", re.IGNORECASE
 )
 _SUFFIXES = {
     "t": 1e12, "g": 1e9, "meg": 1e6, "x": 1e6, "k": 1e3, "mil": 25.4e-6, "m": 1e-3, "u": 1e-6,
-    "n": 1e-9, "p": 1e-12, "f": 1e-15,
+    "\u00b5": 1e-6, "\u03bc": 1e-6, "n": 1e-9, "p": 1e-12, "f": 1e-15,
 }
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _IN_EXPRESSION = re.compile(
-    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?[A-Za-z]*)|(?P<word>[A-Za-z_]\w*)"
+    r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\w*)|(?P<word>[A-Za-z_]\w*)"
 )
 
 
@@ -93,7 +94,7 @@ class _Scope(NamedTuple):
 
     def quantity(self, text: str) -> str:
         """``v(node)`` or ``i(element)`` as the plant has them, anything else as it stands."""
-        match = re.fullmatch(r"([vi])\((\w+)\)", text.replace(" ", ""))
+        match = re.fullmatch(r"([vi])\(([^,]+)\)", text.replace(" ", ""))
         if match is None:
             return text
         name = self.node(match[2]) if match[1] == "v" else self.prefix + match[2]
@@ -221,6 +222,7 @@ class Netlist:
     parameters: dict[str, float | str] = field(default_factory=dict)
     initial: dict[str, float] = field(default_factory=dict)  # by ``v(out)`` or ``i(l1)``
     saved: list[str] = field(default_factory=list)  # quantities
+    _inside: dict[str, str] = field(default_factory=dict)  # in what, by prefix, a node is
 
     def expand(self, block: _Block, scope: _Scope) -> None:
         """Read the lines of a block, in which its own parameters are known, too."""
@@ -264,13 +266,17 @@ class Netlist:
         plain = number(inner.strip())
         if plain is not None:
             return plain
-        known = {**{name: name for name in RESERVED}, **scope.known, "time": "t", "t": "t"}
+        known = {**{name: name for name in RESERVED}, "time": "t", **scope.known}
 
         def translated(match: re.Match[str]) -> str:
             if match["number"]:
                 digits = str(match["number"])
-                found = None if digits[-1].isdigit() or digits[-1] == "." else number(digits)
-                return digits if found is None else repr(found)
+                found = number(digits)
+                if found is None:
+                    raise scope.place.error(
+                        f"{what}: {digits} is no number; its suffix stands behind it, as in 4.7k"
+                    )
+                return digits if digits[-1].isdigit() or digits[-1] == "." else repr(found)
             word = match["word"].lower()
             if word not in known:
                 raise scope.place.error(
@@ -297,6 +303,10 @@ class Netlist:
         elif head in (".include", ".inc", ".lib"):
             raise place.error(
                 f"{head} would read another file, and a netlist is read alone; put its lines here"
+            )
+        elif head == ".global":
+            raise place.error(
+                ".global is not read; give each subcircuit a node of its own for it, and hand it on"
             )
         elif head in (".model", ".func"):
             raise place.error(
@@ -330,11 +340,28 @@ class Netlist:
                     + nearest(key, block.defaults)
                 )
         inside = scope.prefix + plain[0].lower() + "_"
-        ports = dict(zip(block.ports, map(scope.node, ends), strict=True))
+        ports = dict(zip(block.ports, self._nodes(ends, scope), strict=True))
+        if ports.get(GROUND, GROUND) != GROUND:
+            raise place.error(
+                f"{plain[0]}: ground, a node of the subcircuit {block.name}, cannot be "
+                f"{ports[GROUND]} outside; call it otherwise inside"
+            )
         inner = dict(scope.known)
         for key, default in block.defaults.items():
             inner[key] = self._parameter(inside + key, given.get(key, default), scope)
         self.expand(block, _Scope(ports, inner, inside, scope.depth + 1))
+
+    def _nodes(self, words: Sequence[str], scope: _Scope) -> tuple[str, ...]:
+        """Nodes as the plant has them (ConfigError: one in something else is called the same)."""
+        found = tuple(map(scope.node, words))
+        for word, node in zip(words, found, strict=True):
+            own = scope.prefix if node != GROUND and _node(word) not in scope.nodes else None
+            if own is not None and self._inside.setdefault(node, own) != own:
+                raise scope.place.error(
+                    f"the node {word} and one of another (sub)circuit are both {node} in the "
+                    "plant; call one otherwise"
+                )
+        return found
 
     def _element(self, plain: list[str], options: dict[str, str], scope: _Scope) -> None:
         name, kind, place = plain[0], plain[0][0].upper(), scope.place
@@ -349,7 +376,7 @@ class Netlist:
             ends, rest = plain[1 : 1 + count], plain[1 + count :]
             if len(ends) < count:
                 raise place.error(f"{name} needs {count} nodes and has {len(ends)}")
-            where = tuple(map(scope.node, ends))
+            where = self._nodes(ends, scope)
             element = self._valued(kind, name, where, rest, options, scope)
         full = scope.prefix + name
         if not _WORD.fullmatch(full):
@@ -364,7 +391,7 @@ class Netlist:
 
     def _coupling(self, plain: Sequence[str], scope: _Scope) -> Element:
         name, place = plain[0], scope.place
-        if len(plain) != 4:
+        if len(plain) != 4 or plain[1].lower() == plain[2].lower():
             raise place.error(f"{name} needs two inductors and a coefficient, as K1 L1 L2 0.9")
         value = self.value(plain[3], scope, name)
         if isinstance(value, float) and not abs(value) <= 1.0:
@@ -505,7 +532,7 @@ def _pulse(numbers: Sequence[float]) -> str:
         )
     if count > 1_000:
         raise ValueError(f"has {count:g} pulses; at most 1000 are read")
-    times, values = [0.0], [low]
+    times, values = list[float](), list[float]()
     for k in range(int(count) or 1):
         start = delay + k * period
         times += [start, start + rise, start + rise + width, start + rise + width + fall]
@@ -516,17 +543,20 @@ def _pulse(numbers: Sequence[float]) -> str:
 
 
 def _corners(times: Sequence[float], values: Sequence[float]) -> str:
-    """A piecewise linear function as a sum of ramps and jumps, constant outside."""
-    terms, slope = [repr(values[0])], 0.0
-    points = [*zip(times, values, strict=True), (math.inf, values[-1])]
+    """A piecewise linear function, constant outside: what it is on each piece, on that piece only.
+
+    A sum of ramps would lose digits behind each steep one. Terms stand in groups, because Python's
+    parser nests them.
+    """
+    terms, points = [repr(values[0])], [*zip(times, values, strict=True)]
     for (t, value), (until, end) in itertools.pairwise(points):
-        jump, new = (0.0, (end - value) / (until - t)) if until > t else (end - value, 0.0)
-        if new != slope:
-            terms.append(f"{new - slope!r}*(t - {t!r})*step(t - {t!r})")
-        if jump:
-            terms.append(f"{jump!r}*step(t - {t!r})")
-        slope = new
-    return " + ".join(terms)
+        if until > t and (end != value or value != values[0]):
+            slope = f" + {(end - value) / (until - t)!r}*(t - {t!r})" if end != value else ""
+            terms.append(f"({value - values[0]!r}{slope})*(step(t - {t!r}) - step(t - {until!r}))")
+    if values[-1] != values[0]:
+        terms.append(f"{values[-1] - values[0]!r}*step(t - {times[-1]!r})")
+    groups = [" + ".join(terms[k : k + _GROUP]) for k in range(0, len(terms), _GROUP)]
+    return groups[0] if len(groups) == 1 else f"({') + ('.join(groups)})"
 
 
 _SHAPES = {"sin": _sin, "exp": _exp, "pwl": _pwl, "pulse": _pulse}

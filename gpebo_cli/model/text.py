@@ -340,6 +340,17 @@ class TextCoefficients:
         places = [s.argument for s in self.tape.switches]
         return self.tape.of([place for place in places if place not in self.tape.of_time])
 
+    @cached_property
+    def sided(self) -> tuple[Tape, Tape]:
+        """Arguments that follow signals, inputs as well, of sign, and of all that switches.
+
+        Values of abs, min and max have no sides, but their derivatives do.
+        """
+        followers = self.tape.following(range(self.m + len(self.outputs)))
+        signs = {i.arguments[0] for i in self.tape.instructions if i.operation == "sign"}
+        every = {s.argument for s in self.tape.switches}
+        return self.tape.of(sorted(signs & followers)), self.tape.of(sorted(every & followers))
+
     def with_cells(self, cells: Array) -> TextCoefficients:
         """The same with ``cells`` (number,) among the edges of what is resolved in time."""
         return replace(self, restricted=replace(self.of_time, cells=cells))
@@ -362,6 +373,10 @@ class FollowsSignals(CoefficientSource, Protocol):
     def switches(self) -> Tape:
         """Arguments of sign, abs, min and max that follow outputs."""
 
+    @property
+    def sided(self) -> tuple[Tape, Tape]:
+        """Arguments of sign, and of all that switches, that follow inputs or outputs."""
+
     def blurred(self, cuts: Array) -> Array:
         """By how much breakpoints (C,) may be wrong beside rounding of the time, in seconds."""
 
@@ -375,6 +390,12 @@ class FollowsSignals(CoefficientSource, Protocol):
 def switching(source: CoefficientSource) -> Tape | None:
     """Arguments of what jumps or has a kink where outputs say so, if there are any known."""
     found = source.switches if isinstance(source, FollowsSignals) else None
+    return found if found is not None and found.outputs else None
+
+
+def sided(source: CoefficientSource, order: int = 0) -> Tape | None:
+    """Arguments of what jumps where signals say so, up to an order, if there are any known."""
+    found = source.sided[min(order, 1)] if isinstance(source, FollowsSignals) else None
     return found if found is not None and found.outputs else None
 
 

@@ -16,7 +16,7 @@ from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, differential_order
 from gpebo_cli.model.expressions import on_their_side
-from gpebo_cli.model.text import switching
+from gpebo_cli.model.text import sided
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold
@@ -91,7 +91,7 @@ class Measurements:
         def seen(t: Array, inside: Array | None) -> Array:
             return np.concatenate([self.inputs(t, inside), self.outputs(t, inside)], axis=1)
 
-        arguments = None if system is None else switching(system.coefficients)
+        arguments = None if system is None else sided(system.coefficients)
         return seen(on_their_side(arguments, t, inside, seen), inside)
 
     def check_memory(self, system: DescriptorSystem, times: float = 1.0, more: int = 0) -> None:

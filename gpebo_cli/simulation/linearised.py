@@ -21,7 +21,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
 from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
-from gpebo_cli.model.text import FollowsSignals, switching
+from gpebo_cli.model.text import FollowsSignals, sided, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory, signal_scale
 from gpebo_cli.reduction.strangeness_free import forcing
@@ -205,7 +205,8 @@ class Linearised:
         Where something switches, the guess is on its side of that.
         """
         there = on_their_side(
-            self._switching, t, inside, lambda t, inside: self._seen(t, 0, inside)[2][0]
+            sided(self.system.coefficients, order), t, inside,
+            lambda t, inside: self._seen(t, 0, inside)[2][0],
         )
         known, x, along = self._seen(t, order, inside, signals)
         if there is not t:

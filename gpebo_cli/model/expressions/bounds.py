@@ -18,6 +18,7 @@ from gpebo_cli import kernels
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.expressions.jets import NOTHING
 from gpebo_cli.model.expressions.program import Program
 from gpebo_cli.model.expressions.syntax import shorten
 from gpebo_cli.model.expressions.tape import Tape
@@ -285,7 +286,8 @@ def _judged(
     with np.errstate(invalid="ignore"):
         reach = 0.5 * (cells[2] - cells[1]) * np.maximum(-least1, most1)
         away = smooth & ((least > reach) | (most < -reach))
-    possible = (least0 <= 0) & (most0 >= 0) & ~away
+    nothing = np.maximum(-least0, most0) < NOTHING  # as of max(0, .) where that is 0 all along
+    possible = (least0 <= 0) & (most0 >= 0) & ~away & ~nothing
     return possible, possible & smooth & ((least1 > 0) | (most1 < 0)), (least <= 0) & (most >= 0)
 
 
@@ -325,7 +327,7 @@ def blurred(tape: Tape, t: Array) -> Array:
     arguments = tape.of([s.argument for s in tape.switches if s.affine is None])
     if not arguments.outputs:
         return np.zeros(len(t))
-    least, most = (bound[0] for bound in Bounds(arguments).of(t, t, 0))
+    least, most = (bound[0] for bound in Bounds(arguments).of(t, t, 0, t))  # no jump is rounding
     orders = np.arange(1, _MULTIPLE + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         share = _WIDTH * (most - least) / np.abs(arguments.taylor(t, _MULTIPLE, t)[1:])

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-_NOTHING = 1e-290  # less is a zero, also as a bound, which is widened by 2e-308
+NOTHING = 1e-290  # less is a zero, also as a bound, which is widened by 2e-308
 MAX_MULTIPLIED_POWER = 1024  # larger integer exponents take the recurrence, which needs a != 0
 
 Coefficient = NDArray[np.float64] | float
@@ -86,7 +86,7 @@ def power(a: Jet, exponent: float, order: int) -> Jet:
         return p
     # What stays zero has a root with all its derivatives, and they are not 0/0.
     size = sum(np.absolute(each) for each in a)
-    flat = 1.0 - np.greater_equal(size, _NOTHING).astype(np.float64)
+    flat = 1.0 - np.greater_equal(size, NOTHING).astype(np.float64)
     for k in range(1, order + 1):
         total: Coefficient = 0.0
         for j in range(1, min(k, len(a) - 1) + 1):

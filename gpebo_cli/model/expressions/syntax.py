@@ -22,7 +22,7 @@ from gpebo_cli.model.expressions import nodes
 from gpebo_cli.model.expressions.nodes import FoldError, Node
 from gpebo_cli.schema import nearest
 
-MAX_LENGTH = 100_000  # characters of one expression
+MAX_LENGTH = 300_000  # characters of one expression
 MAX_DEPTH = 200  # nesting; a sum or product of many terms is one level
 
 _CALLS: dict[str, tuple[int, Callable[..., Node]]] = {
