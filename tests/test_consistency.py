@@ -18,7 +18,7 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state
-from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
+from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of, units_at
 from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
@@ -188,6 +188,49 @@ def test_equations_within_a_decade_count_as_they_were_written(common):
     c = Coefficients(E[None, None], A[None, None], none, none, none, empty, empty,
                      np.zeros((1, 1, 4)), none, none)
     np.testing.assert_allclose(balance(c).weights, [1.0, 1.0, 1.0, 1e-3])
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS, st.integers(2, 6))
+def test_no_order_and_nothing_unconnected_decides_what_counts_as_within_a_decade(seed, n):
+    """Rows spread over some decades: shuffled, and beside the same in another unit."""
+    rng = np.random.default_rng(seed)
+    E, A = 10.0 ** rng.uniform(-1.0, 1.0, n)[:, None] * rng.normal(size=(2, n, n))
+
+    def weights(E, A):
+        n = len(E)
+        none, empty = np.zeros((1, 1, n, 0)), np.zeros((1, 1, 0))
+        return balance(Coefficients(E[None, None], A[None, None], none, none, none, empty, empty,
+                                    np.zeros((1, 1, n)), none, none)).weights
+
+    plain, order, beside = weights(E, A), rng.permutation(n), np.kron(np.diag([1.0, 500.0]), E)
+    shuffled = weights(E[order], A[order])
+    np.testing.assert_allclose(shuffled / shuffled[0], plain[order] / plain[order[0]])
+    np.testing.assert_allclose(weights(beside, np.kron(np.diag([1.0, 500.0]), A))[:n], plain)
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS, st.integers(2, 4))
+def test_no_order_of_outputs_decides_in_which_units_they_count(seed, r):
+    """But by a factor that states, equations and outputs have in common."""
+    rng = np.random.default_rng(seed)
+    A, C = rng.normal(size=(3, 3)), 10.0 ** rng.uniform(-2.0, 2.0, r)[:, None]
+    C = C * rng.normal(size=(r, 3))
+
+    def units(C):
+        none, empty = np.zeros((1, 1, 3, 0)), np.zeros((1, 1, 0))
+        return units_at(Coefficients(
+            np.eye(3)[None, None], A[None, None], none, none, C[None, None], empty, empty,
+            np.zeros((1, 1, 3)), none, np.zeros((1, 1, r, 0)),
+        ))
+
+    plain, order = units(C), rng.permutation(r)
+    other = units(C[order])
+    assert plain.outputs[0] == other.outputs[0] == 1.0
+    common = other.states / plain.states
+    np.testing.assert_allclose(common, common[0])
+    np.testing.assert_allclose(other.equations, common[0] * plain.equations)
+    np.testing.assert_allclose(other.outputs, common[0] * plain.outputs[order])
 
 
 def test_no_piece_between_jumps_goes_unprobed():
