@@ -75,7 +75,8 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     """
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
     factors, there, _, _ = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)
-    return _scaling(factors, *(there[0] | there[1]).nonzero())
+    i, j = (there[0] | there[1]).nonzero()
+    return _scaling(factors, i, j)
 
 
 def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n: int) -> Scaling:
@@ -125,7 +126,8 @@ def units_at(c: Coefficients) -> Units:
     factors /= np.log(10.0)
     linked = there[0] | there[1]
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
-    first, one = _first_of_each_part(*linked.nonzero(), outputs_first), linked.argmax(axis=0)
+    i, j = linked.nonzero()
+    first, one = _first_of_each_part(i, j, outputs_first), linked.argmax(axis=0)
     start = _references(factors[: n + r], first, (first >= n) == (np.arange(n + r) >= n))
     of_row = np.rint(start - factors[: n + r] + _BESIDE_TIES)
     of_column = np.rint(factors[n + r : -1] + start[one] + _BESIDE_TIES) - of_row[first][one]
