@@ -173,6 +173,25 @@ def test_least_squares_that_follow_stay_at_their_start_until_data_tell():
     assert np.abs(result.estimation.parameters[0, -1, 0] - 0.7) < 1e-4
 
 
+@pytest.mark.parametrize("unbroken", [True, False])
+@pytest.mark.parametrize("rate", [-0.5, 0.4])
+def test_least_squares_that_follow_say_what_is_left_of_their_start(rate, unbroken, monkeypatch):
+    """x' = a x, y = x, from x̂ = 0: without data the error would be x, and it is so much less."""
+    monkeypatch.setattr(linear, "_WINDOW", 1 << 20 if unbroken else 2)
+    plant = plant_from_mapping(one_state(A=[[rate]]))
+
+    def found(f0):
+        run = experiment(plant, {"name": "least_squares", "f0": f0}, horizon=2.0, samples=21,
+                         remedy="current_coordinates")
+        x = run.simulation.states[-1, 0]
+        return run.estimation.requirement, x / abs(run.estimation.states[0, -1, 0] - x) - 1.0
+
+    little, much = found(0.5), found(1e-6)
+    assert not little[0].holds
+    assert little[0].evidence["alpha_lambda_min_over_f0"] == pytest.approx(little[1], rel=1e-6)
+    assert much[0].holds
+
+
 @pytest.mark.parametrize("remedy", ["reset", "current_coordinates"])
 def test_gradient_is_too_slow_for_two_of_them_and_says_so(remedy):
     """With one output the plain gradient cannot pull as fast as errors grow, at any gain."""
