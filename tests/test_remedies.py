@@ -173,6 +173,22 @@ def test_least_squares_that_follow_stay_at_their_start_until_data_tell():
     assert np.abs(result.estimation.parameters[0, -1, 0] - 0.7) < 1e-4
 
 
+@pytest.mark.parametrize("estimator", ["ls_drem", "drem", "fct", "least_squares"])
+@pytest.mark.parametrize("column", [0, 1])
+def test_an_unknown_that_nothing_tells_keeps_no_other_from_being_estimated(estimator, column):
+    """One that does nothing, or one that does what another does, through resets."""
+    F = np.array(MIXED["F"], dtype=float)
+    twice = {**MIXED, "unknowns": {"theta": 0.7, "second": 0.0}, "F": np.hstack([F, column * F])}
+    found, plain = (
+        run(each, 6.0, {"name": estimator}, 31, remedy="reset", reset_interval=1.5).estimation
+        for each in (twice, MIXED)
+    )
+    assert np.isnan(found.parameters[0, -1, :2]).tolist() == [bool(column), True]
+    size = np.abs(plain.states[0]).max(axis=0)
+    assert (np.abs(found.states[0] - plain.states[0])[1:] < 1e-6 * size).all()
+    assert found.requirement.holds == plain.requirement.holds
+
+
 @pytest.mark.parametrize("unbroken", [True, False])
 @pytest.mark.parametrize("rate", [-0.5, 0.4])
 def test_least_squares_that_follow_say_what_is_left_of_their_start(rate, unbroken, monkeypatch):
