@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from plants import experiment, observed, reference, shipped
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from units import Units, in_units
 
@@ -179,10 +180,47 @@ def test_remark_4_gain_for_constant_coefficients(N32):
     assert seven.holds
     assert seven.evidence["integral_M11"] == pytest.approx(-0.5 * 20)
     assert seven.evidence["integral_M22"] == pytest.approx(-2.5 * 20)
-    decay = np.linalg.norm(expm([[-10, 0], [-20, -50]]), 2)
+    decay = np.linalg.norm(expm([[-10, 0], [40, -50]]), 2)  # in units of c1 = −1 and c2 = 2
     assert seven.evidence["transition_norm"] == pytest.approx(decay, rel=1e-5)
     error = result.estimation.states[0, -1, 2:4] - result.simulation.states[-1, 2:4]
     assert np.abs(error).max() < 1e-3
+
+
+@pytest.mark.parametrize("first", [1e-6, 1e6])
+@pytest.mark.parametrize("second", [1e-5, 1.0, 1e5])
+def test_units_of_zb_decide_no_assumption(first, second):
+    """z_b1 and z_b2 in units that are decades apart from that of z_a, and from each other."""
+    states, one = np.array([1, 1, first, first * second, first]), np.ones
+    content = files.shipped("plant/canonical")
+    found, plain = (
+        run(plant_from_mapping(in_units(content, Units(by, one(0), one(4), one(2), by, 1.0))),
+            samples=11, xi_a0={"za1": 1.0}, r0=[by[2], 3.0 * by[3]],
+            L_w=[f"{by[2]} + 0.1*{by[2]}*sin(t)", f"0.5*{by[3]}"])
+        for by in (states, one(5))
+    )
+    np.testing.assert_allclose(found.estimation.states[..., :4] / states[:4],
+                               plain.estimation.states[..., :4], rtol=1e-7, atol=1e-9)
+    norms = [{a.name: a for a in each.assumptions}["Assumption 7"].evidence["transition_norm"]
+             for each in (found, plain)]
+    assert norms[0] == pytest.approx(norms[1], rel=1e-4)
+    assert [a.holds for a in found.assumptions] == [a.holds for a in plain.assumptions]
+
+
+def test_zb_follows_an_estimate_that_is_steep_at_the_start():
+    """ẑ_a − z_a = e₀ f₀/(f₀ + t) of least squares, and what eq. 22 makes of it, by scipy."""
+    f0 = 1e-3
+    system = shipped(
+        "canonical", inputs={"u": 0}, B=[[0]] * 5, parameters={}, outputs=["y1", "y2", "y3"],
+        E=np.diag([1, 1, 0, 0, 0]) + np.eye(5, k=-1) * [0, 0, 1, 1, 0], A=np.diag([0, 0, 1, 1, 1]),
+        C=[[1, 0, 0, 0, 0], [1, 0, 1, 1, 0], [0, 1, 0, 0, 0]], initial_state=[1, 0, 0, 0, 0],
+    )
+    result = run(system, {"name": "least_squares", "f0": f0}, samples=21)
+    t = result.simulation.t
+    exact = solve_ivp(
+        lambda t, r: [-r[0] + f0 / (f0 + t), -r[1] - f0 / (f0 + t)], (0.0, t[-1]), [0.0, 0.0],
+        "DOP853", t, rtol=1e-11, atol=1e-14,
+    ).y[0]
+    np.testing.assert_allclose(result.estimation.states[0, 1:, 2], exact[1:], rtol=1e-8)
 
 
 def test_matrices_against_their_definition():
@@ -215,7 +253,7 @@ def test_matrices_against_their_definition():
         *(
             ({"C": [[1, 0, 0, 0, 0], [0.5, 0, *row]]}, {}, ModelError, "Assumption 6 fails: no")
             for row in (["c1", "c2", "sin(t)"], ["c1", "c2", -0.1], ["c1", "cos(t)", 0],
-                        ["cos(t)", "c2", 0], [1e-10, "c2", 0])
+                        ["cos(t)", "c2", 0], [1e-13, "c2", 0])
         ),
         *((
             {"A": (np.diag([-1.0, -2, 1, 1, 1]) + entry * np.eye(5, k=-2)).tolist()}, {},

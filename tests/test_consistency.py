@@ -18,7 +18,7 @@ from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction.consistency import consistent_state, jumps
-from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
+from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of, units_at
 from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
@@ -184,6 +184,30 @@ def test_scalings_undo_units(seed, n, of_E):
     changed = scaled(rows, columns, 2.0 ** rng.integers(-30, 30))
     for one, other in zip(plain, changed, strict=True):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
+
+
+@settings(deadline=None, max_examples=30)
+@given(SEEDS, st.integers(2, 4))
+def test_no_order_of_outputs_decides_in_which_units_they_count(seed, r):
+    """But by a factor that states, equations and outputs have in common."""
+    rng = np.random.default_rng(seed)
+    A, C = rng.normal(size=(3, 3)), 10.0 ** rng.uniform(-2.0, 2.0, r)[:, None]
+    C = C * rng.normal(size=(r, 3))
+
+    def units(C):
+        none, empty = np.zeros((1, 1, 3, 0)), np.zeros((1, 1, 0))
+        return units_at(Coefficients(
+            np.eye(3)[None, None], A[None, None], none, none, C[None, None], empty, empty,
+            np.zeros((1, 1, 3)), none, np.zeros((1, 1, r, 0)),
+        ))
+
+    plain, order = units(C), rng.permutation(r)
+    other = units(C[order])
+    assert plain.outputs[0] == other.outputs[0] == 1.0
+    common = other.states / plain.states
+    np.testing.assert_allclose(common, common[0])
+    np.testing.assert_allclose(other.equations, common[0] * plain.equations)
+    np.testing.assert_allclose(other.outputs, common[0] * plain.outputs[order])
 
 
 def test_no_piece_between_jumps_goes_unprobed():

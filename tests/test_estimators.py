@@ -800,11 +800,11 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
     extended = np.tile(np.eye(2, 3), (2, 3, 1, 1))
     extended[:, -1, :, :2] = ends
-    assert solved(extended, np.ones(2)).requirement.holds == holds
+    assert solved(extended, extended[:, -1, :, :2], np.ones(2)).requirement.holds == holds
     # Units do not matter.
     unit = np.array([1e-9, 1e4])
     extended[..., :2] /= unit * unit[:, None]
-    assert solved(extended, unit).requirement.holds == holds
+    assert solved(extended, extended[:, -1, :, :2], unit).requirement.holds == holds
 
 
 # A plain field as an axis -----------------------------------------------------------------------

@@ -173,6 +173,41 @@ def test_least_squares_that_follow_stay_at_their_start_until_data_tell():
     assert np.abs(result.estimation.parameters[0, -1, 0] - 0.7) < 1e-4
 
 
+@pytest.mark.parametrize("estimator", ["ls_drem", "drem", "fct", "least_squares"])
+@pytest.mark.parametrize("column", [0, 1])
+def test_an_unknown_that_nothing_tells_keeps_no_other_from_being_estimated(estimator, column):
+    """One that does nothing, or one that does what another does, through resets."""
+    F = np.array(MIXED["F"], dtype=float)
+    twice = {**MIXED, "unknowns": {"theta": 0.7, "second": 0.0}, "F": np.hstack([F, column * F])}
+    found, plain = (
+        run(each, 6.0, {"name": estimator}, 31, remedy="reset", reset_interval=1.5).estimation
+        for each in (twice, MIXED)
+    )
+    assert np.isnan(found.parameters[0, -1, :2]).tolist() == [bool(column), True]
+    size = np.abs(plain.states[0]).max(axis=0)
+    assert (np.abs(found.states[0] - plain.states[0])[1:] < 1e-6 * size).all()
+    assert found.requirement.holds == plain.requirement.holds
+
+
+@pytest.mark.parametrize("unbroken", [True, False])
+@pytest.mark.parametrize("rate", [-0.5, 0.4])
+def test_least_squares_that_follow_say_what_is_left_of_their_start(rate, unbroken, monkeypatch):
+    """x' = a x, y = x, from x̂ = 0: without data the error would be x, and it is so much less."""
+    monkeypatch.setattr(linear, "_WINDOW", 1 << 20 if unbroken else 2)
+    plant = plant_from_mapping(one_state(A=[[rate]]))
+
+    def found(f0):
+        run = experiment(plant, {"name": "least_squares", "f0": f0}, horizon=2.0, samples=21,
+                         remedy="current_coordinates")
+        x = run.simulation.states[-1, 0]
+        return run.estimation.requirement, x / abs(run.estimation.states[0, -1, 0] - x) - 1.0
+
+    little, much = found(0.5), found(1e-6)
+    assert not little[0].holds
+    assert little[0].evidence["alpha_lambda_min_over_f0"] == pytest.approx(little[1], rel=1e-6)
+    assert much[0].holds
+
+
 @pytest.mark.parametrize("remedy", ["reset", "current_coordinates"])
 def test_gradient_is_too_slow_for_two_of_them_and_says_so(remedy):
     """With one output the plain gradient cannot pull as fast as errors grow, at any gain."""

@@ -33,6 +33,7 @@ from gpebo_cli.regression.samples import SampledRegression, integrating
 from gpebo_cli.schema import number
 
 _DIGITS = 1e-12  # reciprocal condition of Ω below which some direction is rounding
+_FILTERED = 1e-11  # error of Ω that is filtered, relative
 _NEEDED = 99.0  # αλ_min(G)/f₀: 1 % of the initial error is left
 _FEW = 3  # gains, and
 _SMALL = 8  # parameters, from which on a few systems are solved instead of taking eigenvectors
@@ -136,8 +137,9 @@ class LeastSquares(ResumableEstimator):
             )
         p = regression.p
         prior = np.column_stack([np.eye(p), self.start(regression.parameters)])
-        ones, begin = np.ones(p), (regression.whole or regression).mesh.edges[0]
-        reached = list[ExtensionState]()
+        whole = regression.whole or regression
+        ones, begin, last = np.ones(p), whole.mesh.edges[0], whole.mesh.edges[-1]
+        reached, from_data = list[ExtensionState](), list[Array]()
 
         def extended(case: Mapping[str, float], before: ExtensionState | None) -> Array:
             """[F⁻¹ | 𝒴] at the times t, (M, p, p + 1)."""
@@ -147,6 +149,9 @@ class LeastSquares(ResumableEstimator):
             )
             reached.append(state_of(found, state))
             gram = found(t)
+            # What the prior has in F⁻¹ at the end is the rest; where β > 0 it is soon forgotten.
+            plain = "f0" in case and not case["beta"] and regression.mesh.edges[-1] == last
+            from_data.append(case["alpha"] * whole.gram_final if plain else gram[-1])
             if "f0" not in case:
                 energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
                 units = prior_units(energy, regression.terms(t), t - begin, rounding)
@@ -154,7 +159,8 @@ class LeastSquares(ResumableEstimator):
             return gram
 
         of_cases = zip(self.cases, known or repeat(None), strict=False)
-        found = solved(np.array([extended(*own) for own in of_cases]), dynamics.units)
+        extensions = np.array([extended(*own) for own in of_cases])
+        found = solved(extensions, np.array(from_data)[..., :p], dynamics.units)
         return replace(found, reached=tuple(reached))
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
@@ -171,11 +177,12 @@ class LeastSquares(ResumableEstimator):
         )
 
 
-def solved(extended: Array, units: Array) -> Found:
+def solved(extended: Array, from_data: Array, units: Array) -> Found:
     """η̂ = F 𝒴 from [F⁻¹ | 𝒴] of every case (cases, M, p, p + 1), where that is more than rounding.
 
     It is solved in units of each parameter's own size; directions of rounding are left at zero.
-    Whether it is regular at the end is judged in ``units`` (p,) in which they are comparable.
+    Whether it is regular at the end is judged in ``units`` (p,) in which they are comparable. What
+    is there of F⁻¹ ``from_data`` (cases, p, p) has to be more than what is left of the prior.
     """
     square = np.einsum("cmii->cmi", extended[..., :-1])
     size = np.sqrt(np.where(square > 0.0, square, 1.0))[..., None]
@@ -185,6 +192,14 @@ def solved(extended: Array, units: Array) -> Found:
     eta = V @ (share * (transpose(V) @ (extended[..., -1:] / size))) / size
     final = np.linalg.svd(extended[:, -1, :, :-1] * units * units[:, None], compute_uv=False)
     worst = float((final[:, -1] / final[:, 0]).min())
+    root = V[:, -1] * np.sqrt(reciprocals(eigenvalues[:, -1], told[:, -1]))[:, None]
+    own = from_data / size[:, -1] / transpose(size[:, -1])
+    # Rounding of F⁻¹ in its weakest direction may look like a prior of so much.
+    rounding = _FILTERED / np.maximum(eigenvalues[:, -1, 0] / eigenvalues[:, -1, -1], _FILTERED)
+    left = 1.0 - np.linalg.eigvalsh(transpose(root) @ own @ root)[:, 0] - rounding
+    reached = float((1.0 / np.maximum(left, _DIGITS) - 1.0).min())
+    if worst >= _DIGITS and reached < _NEEDED:
+        return Found(np.asarray(eta[..., 0]), ratio_requirement(reached, prior=True))
     return Found(np.asarray(eta[..., 0]), Requirement(
         name="F⁻¹ regular", holds=worst >= _DIGITS,
         evidence={"reciprocal_condition": worst, "needed": _DIGITS},

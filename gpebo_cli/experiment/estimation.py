@@ -342,8 +342,8 @@ def _estimate(
 ) -> tuple[EstimationResult, Metrics]:
     """Run every case on the mesh and the samples that are kept; measure on both.
 
-    What is not determined at the end is NaN. If the estimator is not the observer's own and has
-    nothing to carry over resets, the parameters that others can stand for are left out.
+    What is not determined at the end is NaN. If the estimator is not the observer's own, the
+    parameters that others can stand for are left out.
     """
     regression, state_map = observation.regression, observation.state_map
     cases, t = estimator.cases, source.t
@@ -434,12 +434,19 @@ def _estimates(
 
 
 def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
-    """The regression about some of the parameters, the others being zero, and about which."""
+    """The regression about some of the parameters, the others being zero, and about which.
+
+    About all, where what is zero before a reset is not what has to be zero behind it.
+    """
     whole = observation.regression
-    if len(columns) in (0, whole.p) or observation.of_constants is None:
+    constant = replace(observation, regression=replace(whole, resets=())).of_constants is not None
+    others = ~np.isin(np.arange(whole.p), columns)
+    constant &= all(reset.leaves(others) for reset in whole.resets)
+    if len(columns) in (0, whole.p) or not constant:
         return whole, np.arange(len(observation.parameters))
     return replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
+        resets=tuple(reset.about(columns) for reset in whole.resets),
         parameters=tuple(whole.parameters[j] for j in columns),
         factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
         scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],

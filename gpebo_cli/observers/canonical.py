@@ -29,7 +29,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
-from gpebo_cli.model.expressions import parse, taylor
+from gpebo_cli.model.expressions import parse, taylor, with_others
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -46,8 +46,10 @@ from gpebo_cli.schema import unknown
 from gpebo_cli.settings import SolverSettings
 
 _ZERO = 1e-12  # entries below this share of their matrix are zero
-_SMALL = 1e-9  # nothing is divided by entries below this share
-_FINER = 4  # the observer for z_b runs on elements this many times shorter: ẑ_a may be steep
+_SMALL = 1e-9  # nothing is divided by entries that fall below this share of their largest value
+_FINER = 4  # the observer for z_b runs on elements this many times shorter: ẑ_a may be steep,
+_HALVES = 34  # and so often is the first one halved: at the start ẑ_a may be steep at any scale
+_APART = 1e3  # roundings between two edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,6 +260,10 @@ def _unknown_input_observer(
     if system.n - n_a != 3:
         return None
     mesh, _ = mesh.split(np.full(mesh.size, _FINER))
+    begin, end = mesh.edges[:2]
+    near = _APART * float(np.spacing(np.abs(mesh.edges).max()))
+    graded = with_others(mesh.edges, begin + (end - begin) * 0.5 ** np.arange(1, _HALVES), near)
+    mesh = Mesh(graded, mesh.rule)
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     b = canonical_blocks(system, t, inside)
     f_b = np.einsum("nij,nj->ni", b.B[:, n_a:], signals.inputs(t, inside))
@@ -286,8 +292,9 @@ def _unknown_input_observer(
 
 
 def _apart_from_zero(entries: Array, size: Array) -> BoolArray:
-    """Which of the entries (N, …) keep their sign and are, beside ``size``, never small."""
-    return np.asarray(np.maximum(entries.min(axis=0), -entries.max(axis=0)) > _SMALL * size)
+    """Which entries (N, …) keep their sign, are never small, and are no rounding of a ``size``."""
+    least, most = np.maximum(entries.min(axis=0), -entries.max(axis=0)), np.abs(entries).max(axis=0)
+    return np.asarray((least > _SMALL * most) & (most > _ZERO * size))
 
 
 def _output_for_zw(system: DescriptorSystem, settings: Canonical, b: Blocks) -> int:
@@ -333,7 +340,9 @@ def _assumptions(
     system: DescriptorSystem, N: Array, c: Array, M: Trajectory, ell: int
 ) -> tuple[Assumption, ...]:
     """Assumptions 4, 6 and 7 with their evidence."""
-    divided, decay, integral = N[:, [1, 2], [0, 1]], transition_decay(M), M.integral().final
+    divided, integral = N[:, [1, 2], [0, 1]], M.integral().final
+    # z_b1 and z_b2 count by what the output sees of them at the start, in whatever units they are.
+    decay = transition_decay(Trajectory(M.mesh, M.values * c[0, :, None] / c[0]))
     return (
         Assumption(
             "Assumption 4",

@@ -89,8 +89,7 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
 
 def _scaling(factors: Array) -> Scaling:
     """From the logarithms of the factors (2 n + 1,)."""
-    n = len(factors) // 2
-    powers = np.exp2(np.rint(factors / np.log(2.0)))
+    n, powers = len(factors) // 2, np.exp2(np.rint(factors / np.log(2.0)))
     return Scaling(powers[:n], powers[n:-1], float(powers[-1]))
 
 
@@ -117,11 +116,13 @@ def units_at(c: Coefficients) -> Units:
     factors /= np.log(10.0)
     linked = there[0] | there[1]
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
-    open_factor = factors[_first_of_each_part(linked, outputs_first)]
-    of_row = open_factor - factors[: n + r]
-    of_column = factors[n + r : -1] + open_factor[linked.argmax(axis=0)]
+    i, j = linked.nonzero()
+    first, one = _first_of_each_part(i, j, outputs_first), linked.argmax(axis=0)
+    start = _references(factors[: n + r], first, (first >= n) == (np.arange(n + r) >= n))
+    of_row = np.rint(start - factors[: n + r] + _BESIDE_TIES)
+    of_column = np.rint(factors[n + r : -1] + start[one] + _BESIDE_TIES) - of_row[first][one]
     of_column[n:] = np.clip(of_column[n:], -_DECADES, _DECADES)
-    rows, columns = (10.0 ** np.rint(part + _BESIDE_TIES) for part in (of_row, of_column))
+    rows, columns = 10.0 ** (of_row - of_row[first]), 10.0**of_column
     return Units(columns[:n], rows[:n], rows[n:], columns[n:])
 
 
@@ -221,19 +222,38 @@ def _balancing(
     return terms, partial(np.matmul, -inverse @ (each * counts))
 
 
-def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
-    """For each row (a,) the first one, in this order, of those that columns link it to."""
+def _first_of_each_part(i: IntArray, j: IntArray, order: IntArray) -> IntArray:
+    """For each row (a,) the first one, in this ``order``, of those that columns link it to.
+
+    Entries that are not zero are in rows i and columns j.
+    """
     place = np.empty(len(order), dtype=np.intp)
     place[order] = np.arange(len(order))
-    i, j = linked.nonzero()
     while True:
-        of_column = np.full(linked.shape[1], len(order))
+        of_column = np.full(j.max(initial=0) + 1, len(order))
         np.minimum.at(of_column, j, place[i])
         nearer = place.copy()
         np.minimum.at(nearer, i, of_column[j])
+        nearer = nearer[order[nearer]]  # a long chain takes few rounds
         if (nearer == place).all():
             return order[place]
         place = nearer
+
+
+def _references(decades: Array, first: IntArray, counted: BoolArray | bool = True) -> Array:
+    """From where rows (a,) of these ``decades`` are counted in whole ones: (a,) alike in a part.
+
+    Opposite of the widest gap that the ``counted`` rows of the part leave between what they are
+    beside whole decades. So no order of them decides, nor a unit, which moves whole ones alone.
+    """
+    found = np.empty(len(decades))
+    for row in np.unique(first):
+        part = first == row
+        turns = np.sort((decades[part & counted] + _BESIDE_TIES) % 1.0)
+        gaps = np.diff(turns, append=turns[0] + 1.0)
+        widest = int(np.round(gaps, 6).argmax())  # the first of equals
+        found[part] = turns[widest] + 0.5 * gaps[widest] + 0.5 - _BESIDE_TIES
+    return found
 
 
 def scales_of(E: Array, A: Array) -> tuple[Array, Array, float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import reciprocals
 
 _SINGULAR = 1e-14  # share of the largest singular value below which one is rounding
@@ -31,6 +31,19 @@ class Reset:
     def parameters(self, eta: Array) -> Array:
         """η₊ of η (..., p)."""
         return np.asarray(eta @ self.transform.T + self.shift)
+
+    def leaves(self, some: BoolArray) -> bool:
+        """Whether some of η (p,) go on as they are, as unknowns do."""
+        return bool((self.transform[some] == np.eye(len(some))[some]).all())
+
+    def about(self, columns: IntArray) -> Reset:
+        """The same for some of η, where the others are zero and go on as they are."""
+        before, units = (np.broadcast_to(u, len(self.shift)) for u in (self.before, self.units))
+        return replace(
+            self, transform=self.transform[np.ix_(columns, columns)], shift=self.shift[columns],
+            errors=None if self.errors is None else self.errors[columns],
+            before=before[columns], units=units[columns],
+        )
 
 
 @dataclass(frozen=True, eq=False)
