@@ -174,11 +174,12 @@ def test_only_a_sweep_is_resumed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path):
+@pytest.mark.parametrize("swept", [["plant=mine", "estimator.gamma=1,2"], ["plant=circuit,mine"]])
+def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path, swept):
     plant = tmp_path / "plant" / "mine.yaml"
     plant.parent.mkdir()
     plant.write_text(DECAYING)
-    words = ["run", "-m", "--config-dir", ".", "plant=mine", "estimator.gamma=1,2", *FAST]
+    words = ["run", "-m", "--config-dir", ".", *swept, "time.horizon=1", *FAST]
     assert gpebo(*words, "hydra.sweep.dir=sweep", cwd=tmp_path).returncode == 0
     plant.write_text(DECAYING.replace("-1", "-2"))
     done = gpebo(*words, "resume=sweep", cwd=tmp_path)
