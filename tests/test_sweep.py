@@ -12,6 +12,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from plants import DECAYING
 from processes import assert_refused, begin, printed, refused, rows_of, wait_for
@@ -20,6 +23,7 @@ from scipy.integrate import trapezoid
 
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
+from gpebo_cli.cli.composition import _readable
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failures
 from gpebo_cli.cli.sweep_progress import Watch, told
@@ -79,10 +83,20 @@ def test_logspace_is_a_sweep_with_m_but_not_where_it_is_quoted():
 
 @pytest.mark.parametrize("text", ["a", "it's", "a\\b", "a\\", "a\\'b", "a,b {c}=[d] $"])
 def test_quoted_text_is_read_back_by_hydra(text):
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
     (override,) = OverridesParser.create().parse_overrides([f"key={quoted(text)}"])
     assert override.value() == text
+
+
+FORMULAS = ["sin(t)", "max(0, sin(t))", "min(max(u, 0), -(1 + t))", "it's (new)", "2*t", "a b"]
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.lists(st.tuples(st.sampled_from(FORMULAS), st.booleans()), min_size=2, max_size=4))
+def test_formulas_are_swept_whether_or_not_each_of_them_is_quoted(values):
+    word = ",".join(quoted(text) if within else text for text, within in values)
+    parser = OverridesParser.create()
+    swept = parser.parse_override(_readable(parser, f"key={word}", swept=True)).value()
+    assert [getattr(one, "text", one) for one in swept.list] == [text for text, _ in values]
 
 
 @pytest.mark.parametrize(("words", "keys", "count"), [
