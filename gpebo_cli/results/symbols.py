@@ -15,6 +15,7 @@ _LETTERS = {
     "psi": "ψ", "omega": "ω", "Gamma": "Γ", "Delta": "Δ", "Theta": "Θ", "Lambda": "Λ", "Xi": "Ξ",
     "Pi": "Π", "Sigma": "Σ", "Phi": "Φ", "Psi": "Ψ", "Omega": "Ω",
 }
+_INDEXED = re.compile(r"((?:\\.|\{[^{}]*\}|[^\\{}_^])+)(?:([_^])(.*))?", re.DOTALL)
 _WORD = re.compile(r"([A-Za-z]+)(\d*)")
 
 
@@ -86,7 +87,8 @@ def error_of(name: str, labels: Mapping[str, str], *, signed: bool) -> str:
     if not math:
         return f"error of {escaped(name)}"
     # The hat stands on the letter, and not on its index.
-    letter, mark, index = re.fullmatch(r"(.*?)(?:([_^])(.*))?", math, re.DOTALL).groups("")  # type: ignore[union-attr]
+    match = _INDEXED.fullmatch(math)
+    letter, mark, index = match.groups("") if match else (math, "", "")
     hat = f"\\widehat{{{letter}}}" if letter.startswith("\\mathrm") else f"\\hat{{{letter}}}"
     difference = f"{hat}{mark}{index} - {math}"
     return f"${difference}$" if signed else f"$|{difference}|$"
