@@ -302,7 +302,9 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     console = Console(file=io.StringIO(), width=100, color_system=None)
     gains = ("1e6", "100000000.0", "1e9")  # the second one as Hydra tells of 1e8
-    jobs = tuple({"estimator.gamma": gain, "plant": "circuit"} for gain in gains)
+    files = ("[/b]", "[a]", ":x:")  # which are markup to rich
+    jobs = tuple({"estimator.gamma": gain, "plant": "circuit", "data.file": file}
+                 for gain, file in zip(gains, files, strict=True))
     with Watch(tmp_path, Plan(jobs, "x"), [0, 1, 2]) as watch:
         for job, status in enumerate(("done", "failed")):
             (tmp_path / str(job)).mkdir()
@@ -312,8 +314,8 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     said = console.file.getvalue()
     assert "2/3" in said
     assert "left:" in said
-    assert re.search(r"0 +1e6 +done +0\.5 +5\.25", said)
-    assert re.search(r"1 +1e\+08 +failed +0\.5", said)
+    assert re.search(r"0 +1e6 +\[/b\] +done +0\.5 +5\.25", said)
+    assert re.search(r"1 +1e\+08 +\[a\] +failed +0\.5", said)
     assert "plant" not in said, "what is the same for all is left out"
     assert not Watch(tmp_path, Plan(jobs, "x"), [0], quiet=True)._terminal
 
