@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Generic, TypeVar, cast
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import keys, nearest, read
+from gpebo_cli.schema import keys, nearest, read, shown
 
 T = TypeVar("T")
 Capability = TypeVar("Capability")
@@ -81,16 +81,17 @@ class Registry(Generic[T]):
 
     def find(self, settings: Mapping[str, object]) -> type:
         """The dataclass of ``settings["name"]`` (ConfigError)."""
-        name = settings.get("name")
+        given = settings.get("name")
+        name = given if isinstance(given, str) else shown(given)
         if name in self.ours:
             module = import_module(f"gpebo_cli.{self.noun}s.{name}")
             return cast("type", getattr(module, self.noun.upper()))
         if name in (theirs := self.theirs):
-            return self._load(theirs[str(name)])
+            return self._load(theirs[name])
         article = "an" if self.noun[0] in "aeiou" else "a"
         raise ConfigError(
             f"{self.noun}.name: {name!r} is not {article} {self.noun}; known: "
-            f"{', '.join(self.names())}{nearest(str(name), self.names())}; one of your own has to "
+            f"{', '.join(self.names())}{nearest(name, self.names())}; one of your own has to "
             "be installed: pip install -e FOLDER"
         )
 

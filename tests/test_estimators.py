@@ -689,6 +689,7 @@ def test_a_gain_per_parameter_by_name():
     ("settings", "message"),
     [
         ({"name": "dream"}, "'dream' is not an estimator"),
+        ({"name": ["drem"]}, r"\['drem'\].* is not an estimator"),
         ({"name": "drem", "gamma": -1}, "positive number"),
         ({"name": "drem", "gamma": []}, "empty list"),
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),

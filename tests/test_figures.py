@@ -16,6 +16,7 @@ from factories import UNITS, make_result, with_figures, without_observer
 from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from matplotlib.mathtext import MathTextParser
 from matplotlib.text import Text
 from PIL import Image
 
@@ -345,6 +346,15 @@ def test_a_label_that_cannot_be_set_is_refused(label: str) -> None:
     result = replace(result, system=replace(result.system, labels={"il": label}))
     with pytest.raises(ConfigError, match=r"^labels\.il: "):
         draw(result, ["states"])
+
+
+@pytest.mark.parametrize("label", [
+    "i_L", r"a\_b", r"\mathrm{a\_b}_1", r"\frac{a_1}{b}", r"\dot{x_1}", r"\sqrt{x_2}", "{a_b}^c",
+])
+@pytest.mark.parametrize("signed", [False, True])
+def test_a_label_that_can_be_set_has_a_hat_that_can(label: str, signed: bool) -> None:
+    for text in (f"${label}$", symbols.error_of("il", {"il": label}, signed=signed)):
+        MathTextParser("agg").parse(text)
 
 
 def test_an_error_with_its_sign_on_a_linear_axis() -> None:

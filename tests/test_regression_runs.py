@@ -9,7 +9,7 @@ import pytest
 import yaml
 from examples import assert_repeats, gpebo
 from plants import one_state
-from processes import assert_refused, printed, rows_of, write_table
+from processes import assert_refused, printed, refused, rows_of, write_table
 
 from gpebo_cli import ConfigError, SolverError, check, run
 from gpebo_cli.observers.regression import Given
@@ -43,6 +43,8 @@ def test_it_stands_in_place_of_a_plant_and_an_observer(tmp_path):
         assert_refused(done, f"{word}: regression=NAME stands in place of")
     done = gpebo("run", "observer=regression", cwd=tmp_path)
     assert_refused(done, "observer=regression goes with regression=NAME")
+    with refused("regression sine goes with observer=regression"):  # a recipe may ask for another
+        run({**SINE, "psi": [["s", 1]]}, observer="gpebo")
 
 
 def test_signals_from_a_recording(tmp_path):

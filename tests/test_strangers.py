@@ -305,6 +305,7 @@ BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     (DECAYING + "title: !!binary aGFsbG8=\n", "a file is plain data"),
     (DECAYING + "n: 0x_\n", "a number that cannot be read"),
     (DECAYING + f"n: {'9' * 5000}\n", "a number that cannot be read"),
+    *[(DECAYING + f"n: {x}\n", f"{x} is a number of base 8") for x in ("-010", "0_7", "1:30")],
     ("name: [", "not valid YAML"),
     ("name: a\0b\n", "not valid YAML"),
     ("- 1\n", "expected a mapping"),

@@ -12,6 +12,9 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from plants import DECAYING
 from processes import assert_refused, begin, printed, refused, rows_of, wait_for
@@ -20,6 +23,7 @@ from scipy.integrate import trapezoid
 
 from gpebo_cli import run
 from gpebo_cli.cli.arguments import logspace, parse, quoted
+from gpebo_cli.cli.composition import _readable
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failures
 from gpebo_cli.cli.sweep_progress import Watch, told
@@ -79,10 +83,20 @@ def test_logspace_is_a_sweep_with_m_but_not_where_it_is_quoted():
 
 @pytest.mark.parametrize("text", ["a", "it's", "a\\b", "a\\", "a\\'b", "a,b {c}=[d] $"])
 def test_quoted_text_is_read_back_by_hydra(text):
-    from hydra.core.override_parser.overrides_parser import OverridesParser
-
     (override,) = OverridesParser.create().parse_overrides([f"key={quoted(text)}"])
     assert override.value() == text
+
+
+FORMULAS = ["sin(t)", "max(0, sin(t))", "min(max(u, 0), -(1 + t))", "it's (new)", "2*t", "a b"]
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.lists(st.tuples(st.sampled_from(FORMULAS), st.booleans()), min_size=2, max_size=4))
+def test_formulas_are_swept_whether_or_not_each_of_them_is_quoted(values):
+    word = ",".join(quoted(text) if within else text for text, within in values)
+    parser = OverridesParser.create()
+    swept = parser.parse_override(_readable(parser, f"key={word}", swept=True)).value()
+    assert [getattr(one, "text", one) for one in swept.list] == [text for text, _ in values]
 
 
 @pytest.mark.parametrize(("words", "keys", "count"), [
@@ -174,11 +188,12 @@ def test_only_a_sweep_is_resumed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
-def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path):
+@pytest.mark.parametrize("swept", [["plant=mine", "estimator.gamma=1,2"], ["plant=circuit,mine"]])
+def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path, swept):
     plant = tmp_path / "plant" / "mine.yaml"
     plant.parent.mkdir()
     plant.write_text(DECAYING)
-    words = ["run", "-m", "--config-dir", ".", "plant=mine", "estimator.gamma=1,2", *FAST]
+    words = ["run", "-m", "--config-dir", ".", *swept, "time.horizon=1", *FAST]
     assert gpebo(*words, "hydra.sweep.dir=sweep", cwd=tmp_path).returncode == 0
     plant.write_text(DECAYING.replace("-1", "-2"))
     done = gpebo(*words, "resume=sweep", cwd=tmp_path)
@@ -287,7 +302,9 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     monkeypatch.setattr("sys.stderr.isatty", lambda: True, raising=False)
     console = Console(file=io.StringIO(), width=100, color_system=None)
     gains = ("1e6", "100000000.0", "1e9")  # the second one as Hydra tells of 1e8
-    jobs = tuple({"estimator.gamma": gain, "plant": "circuit"} for gain in gains)
+    files = ("[/b]", "[a]", ":x:")  # which are markup to rich
+    jobs = tuple({"estimator.gamma": gain, "plant": "circuit", "data.file": file}
+                 for gain, file in zip(gains, files, strict=True))
     with Watch(tmp_path, Plan(jobs, "x"), [0, 1, 2]) as watch:
         for job, status in enumerate(("done", "failed")):
             (tmp_path / str(job)).mkdir()
@@ -297,8 +314,8 @@ def test_on_a_terminal_a_table_fills_and_says_what_is_left(tmp_path, monkeypatch
     said = console.file.getvalue()
     assert "2/3" in said
     assert "left:" in said
-    assert re.search(r"0 +1e6 +done +0\.5 +5\.25", said)
-    assert re.search(r"1 +1e\+08 +failed +0\.5", said)
+    assert re.search(r"0 +1e6 +\[/b\] +done +0\.5 +5\.25", said)
+    assert re.search(r"1 +1e\+08 +\[a\] +failed +0\.5", said)
     assert "plant" not in said, "what is the same for all is left out"
     assert not Watch(tmp_path, Plan(jobs, "x"), [0], quiet=True)._terminal
 

@@ -63,13 +63,14 @@ def summing(f0):
     return at
 
 
-def test_the_mean_of_white_samples():
+@pytest.mark.parametrize(("rows", "step"), [(100, 0.1), (1, 20.0)])
+def test_the_mean_of_white_samples(rows, step):
     """Var = σ²T_s·t/(f₀ + t)² at the instants, and between them what the part of a sample adds."""
-    sigma, step, f0 = 0.3, 0.1, 0.5
+    sigma, f0 = 0.3, 0.5
     t = np.array([0.1, 0.25, 1.0, 7.03, 10.0])
     of_eta, of_x = deviations(
         directly, summing(f0), np.full((5, 1, 1), 2.0), np.linspace(0, 10, 5),
-        Rows(np.arange(100) * step), np.array([sigma**2]), t,
+        Rows(np.arange(rows) * step), np.array([sigma**2]), t,
     )
     whole = np.floor(t / step + 1e-9)
     part = t - whole * step

@@ -39,7 +39,7 @@ from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
 
 _INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
-_BETWEEN = re.compile(r",(?![^(]*\))")  # commas that are not within an expression's brackets
+_CLOSES = {"(": ")", "[": "]", "{": "}", "'": "'", '"': '"'}
 _BY_SIGNAL = re.compile(r"data\.(columns|hold|scale)\.\w+=")
 _PLUGINS = ("hydra_plugins.", "hydra._internal.core_plugins.")
 
@@ -166,13 +166,30 @@ def _readable(parser: OverridesParser, word: str, *, swept: bool) -> str:
         parser.parse_override(word)
     except HydraException:
         key, _, value = word.partition("=")
+        if swept and len(pieces := _pieces(value)) > 1:
+            each = (_readable(parser, f"{key}={piece}", swept=False) for piece in pieces)
+            return f"{key}={','.join(one.removeprefix(f'{key}=') for one in each)}"
         if value.startswith(("[", "{")):
             with suppress(ConfigError):
                 return f"{key}={_quoted_within(parse(value, key))}"
         elif key and key not in GROUPS and value and value[0] not in "'\"":
-            texts = _BETWEEN.split(value) if swept else [value]
-            return f"{key}={','.join(map(quoted, texts))}"
+            return f"{key}={quoted(value)}"
     return word
+
+
+def _pieces(value: str) -> list[str]:
+    """What a sweep gives one after the other: between commas that no brackets and quotes hold."""
+    pieces, ends = [""], ""
+    for letter in value:
+        if letter == "," and not ends:
+            pieces.append("")
+            continue
+        if letter == ends[-1:]:
+            ends = ends[:-1]
+        elif ends[-1:] not in ("'", '"') and (letter in "([{" or not pieces[-1]):
+            ends += _CLOSES.get(letter, "")  # quotes count in front alone: it's
+        pieces[-1] += letter
+    return pieces
 
 
 def _quoted_within(value: object) -> str:

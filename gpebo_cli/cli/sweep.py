@@ -7,7 +7,7 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -96,7 +96,6 @@ def run_sweep(
     """
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
-    plan = Plan(tuple(map(_overrides, jobs)), _digest(config))
     # Unresolved: Hydra numbers the folders of jobs, job by job.
     sweep = cast("dict[str, Any]", OmegaConf.to_container(config.hydra.sweep, resolve=False))
     if (given := sweep.get("subdir")) != _SUBDIR:
@@ -104,7 +103,7 @@ def run_sweep(
             f"hydra.sweep.subdir={given}: the folders of jobs are numbered, so that a sweep can be "
             "resumed; leave it away"
         )
-    _check_composition(jobs, config, loader)
+    plan = Plan(tuple(map(_overrides, jobs)), _digest(_compositions(jobs, config, loader)))
     _check_folder(folder, plan, resume=orders.resume is not None)
     before = sweep_folder.read_records(folder, plan)
     waiting = [record.job for record in before if record.status != "done"]
@@ -211,21 +210,25 @@ def _unquoted(value: str) -> str:
     return parsed if isinstance(parsed, str) else value
 
 
-def _digest(config: DictConfig) -> str:
-    """Digest of everything the jobs share: a resumed sweep must not mix two versions of a plant."""
-    content = OmegaConf.to_container(config, resolve=False)
-    cast("dict[str, Any]", content).pop("hydra", None)
-    text = OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+def _digest(configs: Iterable[DictConfig]) -> str:
+    """Digest of what the jobs are made of: a resumed sweep must not mix two versions of a plant."""
+    found = hashlib.sha256()
+    for config in configs:
+        content = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
+        content.pop("hydra", None)
+        found.update(OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True).encode())
+    return found.hexdigest()[:16]
 
 
-def _check_composition(
+def _compositions(
     jobs: Sequence[Sequence[str]], config: DictConfig, loader: ConfigLoader
-) -> None:
-    """Compose one job for each choice of files: other values cannot make keys appear or vanish.
+) -> Iterator[DictConfig]:
+    """What all jobs share, and one job for each choice of files.
 
-    Hydra composes every job twice, which takes longer than most jobs.
+    Other values cannot make keys appear or vanish, and Hydra composes every job twice, which takes
+    longer than most jobs (ConfigError, Hydra's errors: one cannot be composed).
     """
+    yield config
     seen = set()
     for job in jobs:
         pairs = [text.partition("=") for text in job]
@@ -235,7 +238,7 @@ def _check_composition(
         )
         if kind not in seen:
             seen.add(kind)
-            loader.load_sweep_config(config, list(job))
+            yield loader.load_sweep_config(config, list(job))
 
 
 def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:

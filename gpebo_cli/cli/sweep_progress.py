@@ -70,6 +70,7 @@ class Watch:
 def table(ended: Sequence[JobRecord], keys: Sequence[str]) -> Table:
     """The jobs that ended last: what varies, how long they took, how the first case went."""
     from rich.table import Table
+    from rich.text import Text
 
     words = shown_metrics(record.cases[0] for record in ended if record.cases)
     shown = (next(iter(words)), "final_error_states")
@@ -79,7 +80,8 @@ def table(ended: Sequence[JobRecord], keys: Sequence[str]) -> Table:
         first = (record.cases or [{}])[0]
         numbers = [record.seconds, *(first.get(name) for name in shown)]
         found.add_row(
-            str(record.job), *(told(record.overrides.get(key, "")) for key in keys), record.status,
+            str(record.job), *(Text(told(record.overrides.get(key, ""))) for key in keys),
+            record.status,  # a bare text would have its brackets read as markup
             *("" if number is None else f"{number:.4g}" for number in numbers),
             style="red" if record.status == "failed" else None,
         )

@@ -30,6 +30,7 @@ _HEADER = re.compile(r"\s*#\s*@package\s+(\S+)")
 _CHOICE = re.compile(rf"(?:(?:optional|override)\s+)*/?({'|'.join(GROUPS)}|(?:hydra/)?launcher)")
 _NAME = re.compile(r"[\w -]+(\.[\w -]+)*(/[\w -]+(\.[\w -]+)*)*")
 _SWEPT = re.compile(rf"(?:{'|'.join((*GROUPS, *KEYS))})(?:\.[\w-]+)*")
+_SECTIONS = (*GROUPS, "time", "excitation", "output")
 _SWEEPER_KEYS = ("params", "max_batch_size", "fail_fast")
 
 
@@ -118,9 +119,14 @@ def _checked(real: str, path: str, inside: str) -> dict[str, Any]:
 
 def _recipe(path: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """A recipe or a whole configuration: choices, values of known keys, and a sweep."""
-    for key in content:
+    for key, value in content.items():
         if key not in (*KEYS, "defaults", "hydra"):
             raise unknown(f"{path}: {shown(key)}: no such key", key, KEYS, "there are")
+        if key in _SECTIONS and not isinstance(value, dict | None):
+            choice = f"; files are chosen as in `- override /{key}: NAME`" if key in GROUPS else ""
+            raise ConfigError(
+                f"{path}: {key}: expected a mapping of keys to values, got {shown(value)}{choice}"
+            )
     recipe = dict(content)
     defaults = recipe.pop("defaults", None)
     if defaults is not None:

@@ -16,6 +16,7 @@ import yaml
 from gpebo_cli.errors import ConfigError
 
 _MAX_DEPTH = 50
+_OLD = re.compile(r"[-+]?(0[0-7_]+$|\d[\d_]*:)")
 _DEEP = f"nested more than {_MAX_DEPTH} levels deep"
 _MAX_ENTRIES = 200_000  # aliases expanded; OmegaConf builds some 20,000 a second
 
@@ -113,6 +114,9 @@ class _Builder:
         make = _PLAIN.get(tag)
         if make is None:
             return text
+        if _OLD.match(text):
+            self._refuse(event, f"{text[:60]} is a number of base 8 or 60 to some readers of YAML; "
+                                "write it without a 0 in front and colons, or in quotes")
         try:
             return make(yaml.ScalarNode(tag, text))
         except ValueError:  # digits of 0x_, or too many

@@ -102,7 +102,8 @@ def grouped(rows: Rows, end: float, t: Array, starts: Array, most: int, per: int
 def each_alone(rows: Rows, starts: Array) -> Groups:
     """Rows, each with its own error; splines begin anew at ``starts`` (S,), in seconds."""
     t = rows.t
-    pieces = np.split(t, np.searchsorted(t, starts[1:] - 1e-6 * np.diff(t).min()))
+    near = 1e-6 * np.diff(t, append=np.inf).min()  # of one row there is no interval
+    pieces = np.split(t, np.searchsorted(t, starts[1:] - near))
     pieces = [np.append(x, after[:1]) for x, after in pairwise([*pieces, _NONE])]
     if rows.hold == "cubic" and min(map(len, pieces)) > _DEGREE:
         return _of_splines(pieces)

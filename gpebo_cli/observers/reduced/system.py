@@ -223,9 +223,14 @@ def choose_form(
     (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known;
     of a single time the structure is judged by the plant over the seconds ``ahead``. ``units`` are
     those in which everything counts; None: of the plant at the start. ``piecewise`` the matrices
-    are looked at piece by piece, and those of the first times do, unless E moves (ConfigError: no
-    outputs, wrong weights, a derivative of an input that is not known).
+    are looked at piece by piece, and those of the first times do, unless E moves (ConfigError: a
+    regression, no outputs, wrong weights, a derivative of an input that is not known).
     """
+    if system.regression is not None:
+        raise ConfigError(
+            f"regression {system.name} goes with observer=regression (`- override /observer: "
+            "regression` in a recipe); this observer is for plants"
+        )
     if system.r == 0:
         raise ConfigError(
             f"plant {system.name}: the observer needs outputs and C; without them use observer=none"
