@@ -19,7 +19,7 @@ from gpebo_cli.reduction.structure import Structure
 
 _EPS = float(np.finfo(float).eps)
 _ROUNDING = 16  # units in the last place of everything that a value is made of
-_IMPULSE = 1e-9  # impulses below this share of the state's size are rounding
+_IMPULSE = 1e-9  # impulses below this share of what they are made of are rounding
 
 
 def consistent_state(
@@ -108,9 +108,12 @@ def jumps(
         # Rows by their own size: an equation in microfarads weighs as much as one in ohms.
         size = np.abs(matrix).max(axis=1)
         size[size == 0] = 1.0
-        w, *_ = np.linalg.lstsq(matrix / size[:, None], right / size, rcond=1e-12)
-        residual = np.abs(matrix @ w - right) / size
-        known = np.abs(right / size), np.abs(before / units.columns)
+        matrix, right = matrix / size[:, None], right / size
+        inverse = np.linalg.pinv(matrix, rcond=1e-12)
+        w = inverse @ right
+        w += inverse @ (right - matrix @ w)  # small states beside large ones keep their digits
+        residual = np.abs(matrix @ w - right)
+        known = np.abs(right), np.abs(before / units.columns)
         scale = max(float(x.max(initial=1e-300)) for x in known)
         if residual.max(initial=0.0) > 1e-7 * scale:
             raise ModelError(
@@ -118,8 +121,9 @@ def jumps(
                 f"(residual {residual.max() / scale:.1e}): no state after it satisfies the "
                 "equations; use an input without it, or a horizon that ends before"
             )
+        made_of = np.abs(inverse) @ np.abs(right)
+        w[n:][np.abs(w[n:]) <= _IMPULSE * made_of[n:]] = 0.0
         w = w.reshape(levels, n)
-        w[1:][np.abs(w[1:]) <= _IMPULSE * scale] = 0.0
         # E or A may jump only where it is not multiplied by an impulse.
         for name, all_changes, factors in zip("EA", changes, (w, w[1:]), strict=True):
             change = at(all_changes, k)
