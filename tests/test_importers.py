@@ -28,6 +28,7 @@ from scipy.linalg import eigh, expm, null_space
 
 from gpebo_cli import ConfigError, load_plant, run
 from gpebo_cli.api.choice import plain
+from gpebo_cli.cli.listing import described
 from gpebo_cli.importers import from_control, from_file, from_matrices, from_mechanics, from_netlist
 from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.mechanics import linearise
@@ -55,6 +56,16 @@ def plant_of(text, **options):
 
 def simulated(plant, horizon=10.0):
     return run(plant, observer="none", time={"horizon": horizon})
+
+
+@pytest.mark.parametrize("title", [
+    "John's: a \"filter\"", "null", "'quoted'", 'a "b" \\ c', "12", "yes", "- a # b", "$ {HOME}: x",
+])
+def test_a_title_of_a_netlist_is_that_of_the_plant_and_of_its_line_in_a_list(title, tmp_path):
+    draft = from_netlist(f"{title.replace('$ ', '$')}\nR1 a 0 1\nC1 a 0 1\n", "p")
+    path = tmp_path / "p.yaml"
+    path.write_text(draft.to_yaml())
+    assert load_plant(path).title == described(path)[0] == title
 
 
 def test_what_is_read_is_run_as_it_is():

@@ -17,6 +17,8 @@ KINDS = {
     "noise": "noise",
     "experiments": "experiment",
 }
+# What stands within quotation marks for what.
+_ESCAPED = {"'": {"''": "'"}, '"': {"\\\\": "\\", '\\"': '"'}}
 
 
 def main(words: list[str]) -> int:
@@ -63,10 +65,14 @@ def described(path: str) -> tuple[str, str]:
 def _scalar(text: str) -> str:
     text = text.strip()
     quote = text[:1]
-    if quote in ("'", '"') and text.find(quote, 1) > 0:
-        text = text[1 : text.find(quote, 1)]
+    if quote in _ESCAPED:
+        text = text[1:]
+        for k, mark in enumerate(_ESCAPED[quote]):
+            text = text.replace(mark, chr(k))
+        text = text.partition(quote)[0]
+        for k, meant in enumerate(_ESCAPED[quote].values()):
+            text = text.replace(chr(k), meant)
     else:
         text = text.partition(" #")[0].rstrip()
-    if text in ("null", "~"):
-        return ""
+        text = "" if text in ("null", "~") else text
     return printable(text)  # titles come from other people's files

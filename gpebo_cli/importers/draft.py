@@ -283,5 +283,7 @@ def _scalar(value: object) -> str:
     """One value as YAML writes it inside a list."""
     if isinstance(value, float) and abs(value) < 1e15 and value == int(value):
         value = int(value)
+    if isinstance(value, str):
+        value = value.replace("${", "$ {")  # which no plant file may have: of a netlist's title
     written = yaml.safe_dump([value], default_flow_style=True, width=10**9, allow_unicode=True)
     return written.strip()[1:-1]
