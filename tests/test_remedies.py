@@ -173,14 +173,20 @@ def test_least_squares_that_follow_stay_at_their_start_until_data_tell():
     assert np.abs(result.estimation.parameters[0, -1, 0] - 0.7) < 1e-4
 
 
-@pytest.mark.parametrize("estimator", ["ls_drem", "drem", "fct", "least_squares"])
+@pytest.mark.parametrize(("remedy", "estimator"), [
+    *(({"remedy": "reset", "reset_interval": 1.5}, name)
+      for name in ("ls_drem", "drem", "fct", "least_squares")),
+    *(({"remedy": "current_coordinates"}, name) for name in ("drem", "mre", "least_squares")),
+])
 @pytest.mark.parametrize("column", [0, 1])
-def test_an_unknown_that_nothing_tells_keeps_no_other_from_being_estimated(estimator, column):
-    """One that does nothing, or one that does what another does, through resets."""
+def test_an_unknown_that_nothing_tells_keeps_no_other_from_being_estimated(
+    remedy, estimator, column
+):
+    """One that does nothing, or one that does what another does."""
     F = np.array(MIXED["F"], dtype=float)
     twice = {**MIXED, "unknowns": {"theta": 0.7, "second": 0.0}, "F": np.hstack([F, column * F])}
     found, plain = (
-        run(each, 6.0, {"name": estimator}, 31, remedy="reset", reset_interval=1.5).estimation
+        run(each, 6.0, {"name": estimator}, 31, **remedy).estimation
         for each in (twice, MIXED)
     )
     assert np.isnan(found.parameters[0, -1, :2]).tolist() == [bool(column), True]

@@ -436,17 +436,19 @@ def _estimates(
 def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
     """The regression about some of the parameters, the others being zero, and about which.
 
-    About all, where what is zero before a reset is not what has to be zero behind it.
+    About all, where what is zero at one time is not what has to be zero at another.
     """
     whole = observation.regression
-    constant = replace(observation, regression=replace(whole, resets=())).of_constants is not None
-    others = ~np.isin(np.arange(whole.p), columns)
-    constant &= all(reset.leaves(others) for reset in whole.resets)
-    if len(columns) in (0, whole.p) or not constant:
+    plain = replace(observation, regression=replace(whole, resets=(), dynamics=None))
+    others, moving = ~np.isin(np.arange(whole.p), columns), whole.dynamics
+    stay = all(reset.leaves(others) for reset in whole.resets)
+    stay &= moving is None or moving.leaves(others)
+    if len(columns) in (0, whole.p) or plain.of_constants is None or not stay:
         return whole, np.arange(len(observation.parameters))
     return replace(
         whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
         resets=tuple(reset.about(columns) for reset in whole.resets),
+        dynamics=moving and moving.about(columns),
         parameters=tuple(whole.parameters[j] for j in columns),
         factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
         scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],

@@ -43,6 +43,15 @@ class Dynamics:
         whole = np.pad(rows, ((0, 0), (still, 0), (0, 0)))
         return whole[..., :-1], whole[..., -1]
 
+    def leaves(self, some: BoolArray) -> bool:
+        """Whether some of η (p,) do not move, as unknowns do not."""
+        return not some[len(some) - self.rows.values.shape[2] :].any()
+
+    def about(self, columns: IntArray) -> Dynamics:
+        """The same for some of η, where the others are zero and do not move."""
+        rows = self.rows.values[..., [*columns, -1]]
+        return Dynamics(Trajectory(self.rows.mesh, rows), self.units[columns])
+
     @cached_property
     def growth(self) -> float:
         """By which power of e parameters may grow, ∫ of the largest real part or 0."""
