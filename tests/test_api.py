@@ -100,6 +100,8 @@ def test_a_name_that_is_not_there_is_a_key_error_with_the_nearest_one(circuit):
     assert "V" not in circuit.states
     assert circuit.states.get("V") is None
     assert list(circuit.states) == list(circuit.details.system.states)
+    assert "il_ha" not in circuit
+    assert len({name: circuit[name] for name in circuit}) == 1 + 1 + 1 + 6 + 9  # t, u, y, x, hats
 
 
 def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():

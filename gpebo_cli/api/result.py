@@ -182,11 +182,14 @@ class Result:
         everything = {"t": self.t, **self.inputs, **self.outputs, **self.states}
         if name in everything:
             return everything[name]
-        hats = [estimate + _HAT for estimate in self.estimates]
-        if name in hats:
+        if name in self:
             return self.estimates[name.removesuffix(_HAT)]
-        known = [*everything, *hats]
-        raise UnknownNameError(str(unknown(f"this run has no signal {shown(name)}", name, known)))
+        raise UnknownNameError(str(unknown(f"this run has no signal {shown(name)}", name, self)))
+
+    def __iter__(self) -> Iterator[str]:
+        """Names that ``result[name]`` takes, so that ``name in result`` can be asked."""
+        hats = (estimate + _HAT for estimate in self.estimates)
+        return iter(("t", *self.inputs, *self.outputs, *self.states, *hats))
 
     def __str__(self) -> str:
         return "\n".join(run_lines(self.details))
