@@ -48,7 +48,7 @@ class Dynamics:
         return not some[len(some) - self.rows.values.shape[2] :].any()
 
     def about(self, columns: IntArray) -> Dynamics:
-        """The same for some of η, where the others are zero and do not move."""
+        """The same for η at ``columns`` (k,), where the others are zero and do not move."""
         rows = self.rows.values[..., [*columns, -1]]
         return Dynamics(Trajectory(self.rows.mesh, rows), self.units[columns])
 

@@ -37,7 +37,7 @@ class Reset:
         return bool((self.transform[some] == np.eye(len(some))[some]).all())
 
     def about(self, columns: IntArray) -> Reset:
-        """The same for some of η, where the others are zero and go on as they are."""
+        """The same for η at ``columns`` (k,), where the others are zero and go on as they are."""
         before, units = (np.broadcast_to(u, len(self.shift)) for u in (self.before, self.units))
         return replace(
             self, transform=self.transform[np.ix_(columns, columns)], shift=self.shift[columns],
