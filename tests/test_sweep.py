@@ -581,6 +581,14 @@ def test_a_comparison_has_the_columns_that_are_asked_for(uninterrupted, tmp_path
     assert last["e0_il_hat"] in [row["e0_il_hat"] for row in table]
 
 
+def test_a_folder_that_hydra_would_read_as_something_else_is_refused(tmp_path):
+    folder = tmp_path / "${oc.env:HOME}"
+    folder.mkdir()
+    done = gpebo("run", "-m", "estimator.gamma=1,2", *FAST, "hydra.sweep.dir=s", cwd=folder)
+    assert_refused(done, "${oc.env:HOME}/s: ${ in the path of a sweep")
+    assert list(folder.iterdir()) == []
+
+
 def test_where_jobs_run_is_no_part_of_the_table(tmp_path):
     """A sweep that began with one launcher config goes on with another, or none."""
     words = ["run", "-m", "estimator.gamma=1e6,1e8", *FAST]

@@ -92,10 +92,12 @@ def run_sweep(
     A job is a list of overrides, its number is its place; ``hydra.sweeper`` of ``config``, from
     which all start, says where to go on and when to stop. The launcher runs
     :func:`run_sweep_job` somewhere and returns when all is done (ConfigError: a key of
-    ``hydra.sweep`` that a sweep does not have).
+    ``hydra.sweep`` that a sweep does not have, or a folder that it cannot have).
     """
     orders = config.hydra.sweeper
     folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
+    if "${" in str(folder):  # Hydra would replace it in each job, and write elsewhere
+        raise ConfigError(f"{folder}: ${{ in the path of a sweep; choose another hydra.sweep.dir")
     # Unresolved: Hydra numbers the folders of jobs, job by job.
     sweep = cast("dict[str, Any]", OmegaConf.to_container(config.hydra.sweep, resolve=False))
     if (given := sweep.get("subdir")) != _SUBDIR:

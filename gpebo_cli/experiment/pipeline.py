@@ -93,7 +93,7 @@ def run_experiment(
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated
         file = settings.data.file
-        each = [settings] if not isinstance(file, list) else [
+        each = [settings] if not file or isinstance(file, str) else [
             replace(settings, data=replace(settings.data, file=one)) for one in file
         ]
         source = several.joined_source([read(one, system, levels, samples) for one in each])

@@ -100,7 +100,7 @@ def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
                 f"data: expected a file or a pandas.DataFrame, got {shown(data.frame)}"
             )
         return _from_frame("data", _indexed(data.frame, time), data, system, "")
-    if data.file is None:
+    if not data.file:
         raise ConfigError("data=csv needs data.file=FILE, or data.file=- for standard input")
     if not isinstance(data.file, str):
         raise ConfigError("data.file: here one file is needed, not several")
