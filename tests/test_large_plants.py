@@ -600,6 +600,23 @@ def test_a_full_plant_that_nothing_drives():
     np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
 
 
+@pytest.mark.parametrize("build", [source_on_a_node, current_source, tied, chain])
+def test_a_start_does_not_depend_on_units_of_equations_and_states(build):
+    rng, (E, A, B, C) = np.random.default_rng(2), build(CELLS)
+    n, T = len(E), 1e-5
+    rows, columns, x0 = *10.0 ** rng.uniform(-6, 6, (2, n)), rng.normal(size=n)
+    both = rows[:, None] * columns
+    plain = full_plant(E, A, B, C, "cos(3*t)")
+    other = full_plant(T * E * both, A * both, rows[:, None] * B, C * columns, f"cos(3*t/{T})")
+    starts = [
+        large.large_simulation(replace(system, initial_state=x), TimeSettings(horizon=h),
+                               SolverSettings()).initial_state
+        for system, x, h in ((plain, x0, 1.0), (other, x0 / columns, T))
+    ]
+    assert np.abs(starts[0] - x0).max() > 0.1
+    np.testing.assert_allclose(columns * starts[1], starts[0], atol=1e-11)
+
+
 def test_a_full_plant_starts_from_what_constraints_leave_of_its_momenta():
     """M (v − v₀) is a combination of rows of J, J v = 0, and p follows from the derivative."""
     rng = np.random.default_rng(4)

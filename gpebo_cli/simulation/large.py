@@ -312,23 +312,28 @@ def _start(plant: _Plant, mesh: Mesh) -> tuple[Array, Array]:
     z = form.reduced(x0)
     first = form.at_first()
 
-    def differential(z: Array) -> Array:
-        """E (x − x_0) of the states that z (d, c) gives, (n, c)."""
-        found, off = np.zeros((len(x0), z.shape[1])), first.states_from(z[None])[0] - x0[:, None]
-        (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0, plant.found.which("E")]
-        np.add.at(found, i, values[:, None] * off[j])
+    (i, j), values = plant.found.places["E"], plant.found.values.E[0, 0, plant.found.which("E")]
+
+    def differential(x: Array, values: Array = values) -> Array:
+        """E x (n, c)."""
+        found = np.zeros(x.shape)
+        np.add.at(found, i, values[:, None] * x[j])
         return found
 
-    missed = differential(z[:, None])
-    size = np.abs(form.sizes_from(np.abs(z)[:, None])[:, 0]).max(initial=0.0)
-    if np.abs(missed).max(initial=0.0) > _ROUNDING * EPS * max(size, np.abs(x0).max(initial=0.0)):
-        moves = differential(z[:, None] + np.eye(len(z))) - missed
+    def sizes(z: Array) -> Array:
+        """Of what states (n, 1) are made of."""
+        return np.asarray(first.sizes_from(np.abs(z)[:, None])) + np.abs(x0)[:, None]
+
+    missed = differential(first.states_from(z[None, :, None])[0] - x0[:, None])
+    if (np.abs(missed) > _ROUNDING * EPS * differential(sizes(z), np.abs(values))).any():
+        known = first.states_from(np.zeros((1, len(z), 1)))[0]
+        moves = first.states_from(np.eye(len(z))[None])[0] - known
         kept = _conserved(plant, mesh).T
-        z = z - np.linalg.solve(kept @ moves, kept @ missed)[:, 0]
+        moves, missed = kept @ differential(moves), kept @ missed
+        size = np.abs(moves).max(axis=1, keepdims=True)
+        z = z - np.linalg.solve(moves / size, missed / size)[:, 0]
     x = first.states_from(z[None, :, None])[0, :, 0]
-    known = np.abs(x - x0) <= _ROUNDING * EPS * (first.sizes_from(np.abs(z)[:, None])[:, 0]
-                                                 + np.abs(x0))
-    return np.where(known, x0, x), z
+    return np.where(np.abs(x - x0) <= _ROUNDING * EPS * sizes(z)[:, 0], x0, x), z
 
 
 def _conserved(plant: _Plant, mesh: Mesh) -> Array:
@@ -351,6 +356,8 @@ def _conserved(plant: _Plant, mesh: Mesh) -> Array:
         places[name] = tuple(np.array([*terms]).T[::-1])
         values[name] = np.stack([*terms.values()], axis=2)
     form = adjoint.form_of(Entries(now.values._replace(**values), places), {})
+    if form.d != plant.form.d:
+        raise UndecidedError
     found: Array = form.states_from(np.eye(form.d)[None])[0]
     return found
 
