@@ -74,7 +74,8 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     state or the time by a number changes its factor alone. Terms of E count ``mass`` times.
     """
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    return _scaling(_factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0])
+    factors = _factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0]
+    return _scaling(factors, sizes[0].any(axis=1))
 
 
 def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n: int) -> Scaling:
@@ -86,16 +87,21 @@ def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n
         factors = terms.nearest(np.ones(len(logs)), logs)
         rest = terms.counting(factors, logs)
         if rest.all():
-            return _scaling(factors)
+            return _scaling(factors, np.isin(np.arange(n), i[kind == 0]))
         some[some] = rest
 
 
-def _scaling(factors: Array) -> Scaling:
-    """From the logarithms of the factors (2 n + 1,)."""
+def _scaling(factors: Array, differential: BoolArray) -> Scaling:
+    """From the logarithms of the factors (2 n + 1,), and which rows of E are not zero."""
     n = len(factors) // 2
     r = factors[:n]
-    # A factor of all rows is left open, and means nothing.
-    weights = 10.0 ** np.rint((r - r[:1]) / np.log(10.0))
+    # A factor of all rows is left open, and means nothing. Decades begin where those that count are
+    # far from that: which equation stands first is no matter.
+    decades = r / np.log(10.0)
+    part = np.sort(decades[differential if differential.any() else slice(None)] % 1.0)
+    gaps = np.diff(part, append=part[:1] + 1.0)
+    whole = np.floor(decades - (part + 0.5 * gaps)[gaps.argmax()])
+    weights = 10.0 ** (whole - whole[:1])
     powers = np.exp2(np.rint(factors / np.log(2.0)))
     return Scaling(powers[:n], powers[n:-1], float(powers[-1]), weights)
 
