@@ -345,6 +345,23 @@ def test_comments_of_equations_stand_in_one_column():
         assert len({line.index("  # ") for line in rows}) <= 1, matrix
 
 
+@given(names=st.permutations("pqrsu"))
+@settings(max_examples=6, deadline=None)
+@example(names="qrpsu")
+def test_capacitors_that_cannot_start_as_said_do_not_mind_how_nodes_are_called(names):
+    """C4 and C9, joined by a source, share their charge; C8, behind resistors, keeps its own."""
+    a, b, c, d, e = names
+    text = (
+        f"t\nV1 {a} 0 0.336\nR2 {b} {a} 0.39\nR3 {c} 0 2.7\nC4 {d} 0 0.2367\nR5 {e} {a} 3.5\n"
+        f"R6 {a} 0 4.1\nR7 {b} 0 4.2\nC8 {b} 0 0.6369\nC9 {c} 0 0.3527\nR10 {d} 0 1.07\n"
+        f"R11 {e} 0 0.57\nL12 {c} {e} 0.75\nE14 {c} {d} {a} {b} -0.259\nT15 {a} {e} {e} {a} n=1.5\n"
+    )
+    result = run(from_netlist(text), observer="none", time={"horizon": 1.0, "samples": 3})
+    start, apart = [result[name][0] for name in names], -0.259 * 0.336
+    shared = [0.2367 * apart / (0.2367 + 0.3527), -0.3527 * apart / (0.2367 + 0.3527)]
+    np.testing.assert_allclose(start, [0.336, 0.0, *shared, 0.336], atol=1e-12)
+
+
 def test_a_switched_capacitor():
     """C1 is charged, and then shares its charge with C2, again and again."""
     text = (
