@@ -350,6 +350,7 @@ def test_a_label_that_cannot_be_set_is_refused(label: str) -> None:
 
 @pytest.mark.parametrize("label", [
     "i_L", r"a\_b", r"\mathrm{a\_b}_1", r"\frac{a_1}{b}", r"\dot{x_1}", r"\sqrt{x_2}", "{a_b}^c",
+    r"\left(x_1\right)",
 ])
 @pytest.mark.parametrize("signed", [False, True])
 def test_a_label_that_can_be_set_has_a_hat_that_can(label: str, signed: bool) -> None:

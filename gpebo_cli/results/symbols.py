@@ -86,8 +86,8 @@ def error_of(name: str, labels: Mapping[str, str], *, signed: bool) -> str:
     math = math_of(name, labels)
     if not math:
         return f"error of {escaped(name)}"
-    # The hat stands on the letter, and not on its index.
-    match = _INDEXED.fullmatch(math)
+    # The hat stands on the letter, and not on its index, or on all within \left( … \right).
+    match = None if "\\left" in math else _INDEXED.fullmatch(math)
     letter, mark, index = match.groups("") if match else (math, "", "")
     hat = f"\\widehat{{{letter}}}" if letter.startswith("\\mathrm") else f"\\hat{{{letter}}}"
     difference = f"{hat}{mark}{index} - {math}"
