@@ -203,6 +203,21 @@ def test_trajectory_samples_integrates_and_filters():
     assert mesh.span == (0.5, 4.5)
 
 
+def test_elements_far_from_zero_are_those_at_zero_later():
+    """Of 1e-4 s at 1e9 s: times beside the origin have digits that times themselves do not."""
+    plain = initial_mesh(0.0, 3.0, [], 3, radau_rule(8))
+    moved = replace(plain, origin=1024.0)
+    t = np.linspace(0.0, 3.0, 31)
+    signals = [Trajectory(mesh, np.sin(plain.points)) for mesh in (plain, moved)]
+    for way in (lambda s, t: s(t), lambda s, t: s(t, t - 0.01), lambda s, t: s.integral()(t),
+                lambda s, t: s.taylor(t, 1)[1], lambda s, t: s.low_pass(2.0)(t)):
+        np.testing.assert_allclose(way(signals[1], 1024.0 + t), way(signals[0], t), atol=1e-12)
+    assert moved.span == (1024.0, 1027.0)
+    np.testing.assert_array_equal(moved.points, 1024.0 + plain.points)
+    np.testing.assert_array_equal(moved.inside, 1024.0 + plain.inside)
+    np.testing.assert_array_equal(moved.split(np.array([1, 2, 1]))[0].span, moved.span)
+
+
 def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():
     mesh = initial_mesh(0.0, 2.0, [1.0], 4, radau_rule(5))
     step = Trajectory(mesh, (mesh.inside > 1.0).astype(float))
@@ -591,14 +606,14 @@ def column(*values):
 
 def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
     """Three components: a large one, one that is small beside it, one that rounding makes."""
-    own, made_of, one = column(1.0, 1e-5, 0.0), column(1.0, 1e-5, 0.5), np.ones((3, 1))
+    own, made_of, one = column(2.0, 1e-5, 0.0), column(2.0, 1e-5, 0.5), np.ones((3, 1))
     carried = np.array([[[1e-9], [2e-9], [0.0]], [[3e-9], [1e-9], [0.0]]])
     parts = carried.max(axis=0), column(0.0, 0.0, 4e-9), own, column(0.0, 5e-9, 0.0), made_of
     plain = LinearProblem(lambda t, inside: None, one, floor=column(0.0, 0.0, 1e-2))
     in_units = replace(plain, floor=0.0, units=column(1.0, 1e-4, 1.0))
     for problem, size, beside in (
-        (plain, column(1.0, 1e-3, 1e-2), column(1.0, 1e-3, 1e-2)),
-        (in_units, column(1.0, 1e-5, 0.5), column(1.0, 1e-4, 1.0)),
+        (plain, column(2.0, 2e-3, 1e-2), column(2.0, 2e-3, 1e-2)),
+        (in_units, column(2.0, 1e-5, 0.5), column(2.0, 2e-4, 2.0)),
     ):
         errors = judged_errors(problem, carried, *parts)
         np.testing.assert_allclose(errors.largest, column(3e-9, 7e-9, 4e-9), rtol=1e-5)

@@ -100,15 +100,20 @@ def test_an_explicit_ode_has_index_zero():
     assert result.signals.states(np.array([2.0]))[0, 0] == pytest.approx(0.5, abs=1e-12)
 
 
-@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456])
+@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456, 0.0011, 0.9989])
 def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
     """A probe next to the zero may lie lower than all times of the first closer look."""
-    singular = plant(
-        states=["a", "b"], E=[[1, 0], [0, f"t - {where}"]], A=[[-1, 0], [0, -1]],
-        initial_state=[1, 1],
-    )
-    with pytest.raises(ModelError, match=rf"rank of the derivative array changes at t = {where}"):
-        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+    row = [0, f"t - {where}"]
+    for of, E, A in (
+        ("derivative array", [[1, 0], row], [[-1, 0], [0, -1]]),
+        ("constraints", [[1, 0], [0, 0]], [[-1, 0], row]),
+    ):
+        singular = plant(states=["a", "b"], E=E, A=A, initial_state=[1, 1])
+        said = rf"rank of the {of} changes at t = ([\d.]+) "
+        with pytest.raises(ModelError, match=said) as refusal:
+            simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+        told = float(re.search(said, str(refusal.value))[1])
+        assert told == pytest.approx(where, abs=1e-8)
 
 
 @pytest.mark.parametrize("bottom", [2e-10, 0.0])
