@@ -14,6 +14,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
+from gpebo_cli.observers.reduced.regression import Assembled
 from gpebo_cli.observers.reduced.split import axes_frame, constant_split
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -111,6 +112,45 @@ def test_literal_regressor_is_lossless_where_A22_is_invertible():
     np.testing.assert_allclose(paper.regression.Y(T), paper.regression.psi(T) @ truth, atol=1e-9)
     rank = [np.linalg.matrix_rank(o.regression.gram.final[:, :-1], tol=1e-9) for o in (ours, paper)]
     assert rank == [4, 4]
+
+
+@pytest.mark.parametrize("of_states", [np.ones(5), 10.0 ** np.array([3, -4, 0, 5, -2])])
+@pytest.mark.parametrize("of_parameters", [np.ones(3), np.array([1e-3, 1e5, 1.0])])
+@pytest.mark.parametrize("offset", [True, False])
+def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_parameters, offset):
+    """Each state's gain beside the largest of itself and small shares of what it is made of.
+
+    That is itself, the offset, what the gain of w is and what rounding leaves of it; the last state
+    has no size. ψ has a column that vanishes.
+    """
+    rng, t = np.random.default_rng(0), np.linspace(0.0, 3.0, 7)
+    unit = of_states[:, None] / of_parameters
+    wave = np.cos(t[:, None, None] + np.arange(3.0))
+    gain = np.array([2.0, 1e-9, 1e-9, 1e-9, 0.0])[:, None] * wave * [1.0, 3.0, 0.0]
+    moving = np.array([[1.0, 1, 0], [1, 0, 0], [50, 0, 0], [0, 0, 0], [0, 0, 0]])
+    rounding = np.zeros((5, 5))
+    rounding[3, 2] = 0.1
+    psi, columns = rng.normal(size=(7, 2, 3)) * [1.0, 5.0, 0.0], np.array([1.0, 5.0, 0.0])
+    x = np.array([0.0, 40.0, 0.0, 0.0, 0.0]) * np.cos(t)[:, None] * offset
+    Y = (4.0 * np.sin(t)[:, None] + np.zeros(2)) * offset
+    found = Assembled(
+        Y, psi / of_parameters, x * of_states, gain * unit, 4.0 * offset, columns / of_parameters,
+        np.zeros(5, dtype=bool), np.ones((5, 4)), moving * unit,
+    )
+    by = rounding * of_states[:, None] / of_states
+    rows, regressor, states, gains, squares, products = found.kinds(of_states, None, by)
+    each = np.array([1.0, 5.0, 1.0])
+    largest = (np.abs(gain).max(axis=0) / each).max(axis=1)
+    sizes = np.array([largest[0], 1e-3 * (10.0 if offset else 1.0), 0.05, 5.0, 1.0])
+    for (value, floor), exact, least in (
+        (rows, Y, 4e-3 * offset), (regressor, psi / each, 1e-3), (states, x, 0.0),
+        (gains, gain / sizes[:, None] / each, 0.0),
+        (squares, ((psi / each) ** 2).sum(axis=1), 1e-3),
+        (products, np.einsum("nrp,nr->np", psi / each, Y), 4e-3 * offset),
+    ):
+        np.testing.assert_allclose(value, exact, rtol=1e-12, atol=1e-300)
+        assert floor == pytest.approx(least)
+    assert found.lost(by) == pytest.approx(5.0 / largest[3])
 
 
 def random_block_system(rng, n_a, n_b, r, q, varying):

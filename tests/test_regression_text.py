@@ -74,6 +74,7 @@ def test_a_delay_moves_jumps_exactly():
 
 @pytest.mark.parametrize(("along", "of_time"), [
     ("integral(sign(u))", "integral(sign(sin(t)))"),
+    ("1e9*integral(1e-9*sign(u))", "integral(sign(sin(t)))"),
     ("integral(sign((u - 0.3)*(u - 0.3001)))", "integral(sign((sin(t) - 0.3)*(sin(t) - 0.3001)))"),
     ("lp(sign(lp(u, 2)), 5)", "lp(sign(4*sin(t) - 2*cos(t) + 2*exp(-2*t)), 5)"),
     ("integral(delay(sign(u - 0.5), 1))", "integral(sign(sin(t - 1) - 0.5)*step(t - 1))"),
