@@ -77,6 +77,20 @@ def test_regression_holds_with_the_true_parameters(name):
     np.testing.assert_allclose(e0, expected["e0"], atol=1e-12)
 
 
+def test_only_what_constraints_leave_free_at_the_start_is_unknown():
+    """The voltage e1 is that of the source, which E does not know: its rank is 3."""
+    found = experiment(
+        "circuit", observer={"name": "gpebo", "form": "strangeness_free"},
+        estimator="least_squares", time={"horizon": 5.0, "samples": 101},
+    ).details
+    regression, estimation = found.regression, found.estimation
+    assert estimation.names == ("e0_e2", "e0_il")
+    residual = regression.Y - regression.psi @ estimation.true_parameters[-1]
+    assert np.abs(residual).max() < 1e-9
+    off = estimation.states[0, -1] - found.simulation.states[-1]
+    assert np.abs(off).max() < 1e-5
+
+
 def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
     _, observation, _ = run(shipped("descriptor"))
     assert observation.of_constants is observation.state_map
