@@ -27,6 +27,7 @@ from gpebo_cli.reduction.strangeness_free import (
     strangeness_free_form,
 )
 from gpebo_cli.reduction.structure import (
+    _dips,
     _probe_times,
     _refuse_crossing,
     _why_not,
@@ -377,6 +378,22 @@ def test_rounding_at_some_of_the_times_stands_for_that_at_all():
         np.testing.assert_allclose(some.noise, each.noise[::2].max(), rtol=1e-12)
         assert some.lost.tolist() == [lost]
         assert each.lost[2] == lost
+
+
+@pytest.mark.parametrize(("values", "steady", "dips"), [
+    ([1.0, 0.5, 0.3, 0.5, 1.0], True, []),  # far above zero,
+    ([1.0, 0.5, 0.05, 0.5, 1.0], False, [2]),  # and not, between the ends:
+    ([1.0, 0.1, 0.05, 0.1, 1.0, 0.1, 0.01, 0.1], False, [6, 2]),  # the sharpest one first
+    ([1.0, 0.5, 0.2, 0.1, 0.05], True, [4]),  # towards an end,
+    ([0.05, 0.1, 0.2, 0.5, 1.0], True, [0]),
+    ([1.0, 0.5, 0.1, 0.05, 5e-3], False, [4]),  # where it is little
+])
+def test_dips_of_singular_values_are_local_minima_far_below_the_largest(values, steady, dips):
+    """In any units, and beside columns without any, or with values that are not finite."""
+    column = 3e5 * np.array(values)[:, None]
+    beside = np.where(np.arange(len(values)) == 2, [[0.5], [0.01]], [[1.0], [np.inf]]).T
+    found = _dips(np.hstack([beside, column]))
+    assert found == (steady, [(2, k) for k in dips])
 
 
 def test_what_says_against_an_index_is_named_with_its_time():

@@ -655,6 +655,16 @@ def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monk
         simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
 
 
+def test_elements_are_short_where_a_state_grows_only():
+    """By e^53 within 0.02 s: everywhere as short, they would be 7500."""
+    system = plant(
+        states=["x"], E=[[1]], A=[["3000*exp(-((t - 5)/0.01)**2)"]], initial_state=[1],
+    )
+    states = simulate(system, TimeSettings(horizon=10.0), SOLVER).signals.states
+    assert np.log(states.final[0]) == pytest.approx(30.0 * np.sqrt(np.pi), rel=1e-9)
+    assert states.mesh.size < 2100
+
+
 def test_a_rank_that_a_step_changes_is_named_with_what_vanishes():
     """E loses its second row at t = 1: both ranks, times on both sides, and the singular value."""
     system = plant(states=["a", "b"], E=[[1, 0], [0, "1 - step(t - 1)"]], A=[[-1, 0], [0, -2]],
