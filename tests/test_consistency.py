@@ -17,6 +17,7 @@ from gpebo_cli.errors import ModelError
 from gpebo_cli.kernels.structure_numpy import scaled
 from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.reduction import strangeness_free as reductions
 from gpebo_cli.reduction.consistency import consistent_state
 from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of
 from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
@@ -362,6 +363,26 @@ def test_how_fast_coefficients_move_is_the_largest_slope_beside_its_size():
     model[:, 0], model[0, 1], model[1, 1] = 2.0, 6.0, -4.0
     assert _Rounding(*model, 1).rate == 3.0
     assert _Rounding(*model[:, :1], 1).rate == 0.0  # no slopes are known
+
+
+@pytest.mark.parametrize("most", [1.0, 5.0, 1e6])
+def test_constraints_at_a_time_hang_on_no_other_time(most, monkeypatch):
+    """By pivots or, where these make entries grow, by singular vectors; as some or all times do."""
+    monkeypatch.setattr(reductions, "MAX_GROWTH", most)
+    of, structure, _ = case(2, 3, 4)
+    t = np.linspace(0.0, 5.0, 9)
+    c = of.system.coefficients.taylor(t, structure.mu)
+    E, A, f = c.E, c.A, forcing(c)[..., None]
+    whole = reductions.reduced(of.system, structure, E, A, f, t, 1)
+    some = reductions.reduced(of.system, structure, E, A, f, t, 2)
+    np.testing.assert_array_equal(some.size, whole.size[::2])
+    for k in range(len(t)):
+        at = slice(k, k + 1)
+        one = reductions.reduced(
+            of.system, structure, E[:, at], A[:, at], f[:, at], t[at], 1
+        )
+        for all_of_them, alone in zip(whole, one, strict=True):
+            np.testing.assert_allclose(all_of_them[at], alone, rtol=1e-9, atol=1e-12)
 
 
 def test_rounding_at_some_of_the_times_stands_for_that_at_all():

@@ -103,6 +103,14 @@ def test_it_does_not_matter_when_a_run_starts(start):
         )
 
 
+def test_columns_in_any_unit_take_the_same_elements():
+    texts = ["1e-12/(1.01 - u)", "1/(1.01 - u)", "1e9/(1.01 - u)"]
+    rest = {"unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": [1]}
+    small, one, large = (on_mesh({**rest, "psi": [[text]]}) for text in texts)
+    assert small.mesh.size == one.mesh.size == large.mesh.size
+    np.testing.assert_allclose(one.psi(T)[:, 0, 0], 1.0 / (1.01 - np.sin(T)), rtol=1e-9)
+
+
 @pytest.mark.parametrize("step", [1.0, -1.0])
 def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
     """At an edge of its elements, up or down, while another signal is smooth."""
