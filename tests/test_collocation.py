@@ -665,3 +665,43 @@ def test_errors_of_the_start_are_carried_with_the_solution():
                                          for t in mesh.edges[1:])]
     own = np.abs(found.trajectory.values).max(axis=(0, 1))
     np.testing.assert_allclose((found.errors * own)[:, 0], largest, rtol=1e-5)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("rate", [0.0, 1e7])
+def test_solutions_and_their_errors_are_the_same_in_any_units(apart, rate):
+    """Two states and a third that follows fast or, where constraints are ``apart``, at once.
+
+    The second one is nothing beside the first, but for what rounding of that makes of it.
+    """
+    made = []
+    for units in (np.ones((3, 1)), np.array([[2.0**9], [2.0**-9], [2.0**-3]])):
+        def coefficients(t, inside, units=units):
+            n, fast = len(t), max(rate, 1.0)
+            A, f = np.zeros((n, 3, 3)), np.zeros((n, 3, 1))
+            A[:, 0, 0], A[:, 0, 1], A[:, 1, 1] = -1.0, np.cos(3.0 * t), -0.5
+            A[:, 2, 0], A[:, 2, 2], f[:, 2, 0] = fast * np.sin(t), -fast, fast
+            if not apart:
+                return LinearEquation(None, A * units.T**-1 * units, f * units)
+            basis, offset = np.tile(np.eye(3, 2) * units / units[:2].T, (n, 1, 1)), f * units / fast
+            basis[:, 2, 0] = np.sin(t) * (units[2] / units[0])
+            own, E = A[:, :2] / units.T * units[:2], np.broadcast_to(np.eye(2, 3), (n, 2, 3))
+            constraints = Constraints(basis, offset)
+            return LinearEquation(E, own, 0.0 * f[:, :2], (), constraints)
+
+        amplification = np.array([[0.0, 0, 0, 0], [1e6, 0, 0, 1e5], [0, 1e16, 0, 0]])
+        amplification[:, :3] *= units / units.T
+        amplification[:, 3:] *= units
+        problem = LinearProblem(
+            coefficients, np.array([[1.0], [1e-8], [1.0]]) * units, units=units, rate=rate,
+            floor=1e-9 * units, amplification=amplification, uncertain=1e-9 * units,
+        )
+        mesh = initial_mesh(0.0, 4.0, [], 6, radau_rule(9))
+        made.append(solve(problem, mesh, tol=1e-9, max_elements=999))
+        np.testing.assert_allclose(made[0].uncertain, made[-1].uncertain / units, rtol=0.3)
+    one, other = made
+    np.testing.assert_array_equal(one.trajectory.mesh.edges, other.trajectory.mesh.edges)
+    np.testing.assert_allclose(one.errors, other.errors, rtol=0.3)
+    assert one.error_estimate == pytest.approx(other.error_estimate, rel=0.3)
+    assert (one.vague == other.vague).all()
+    assert one.lost is other.lost is None

@@ -24,7 +24,8 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.simulation.large import dense_structure
+from gpebo_cli.simulation.simulate import _growth_resolved, simulate
 
 SOLVER = SolverSettings()
 
@@ -653,6 +654,21 @@ def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monk
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state=[0])
     with pytest.raises(SolverError, match=why):
         simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-2.0, 2.0))
+def test_no_state_grows_much_within_an_element_and_no_more_are_cut(seed, decades):
+    """By e^4 at most, of elements of any lengths."""
+    rng = np.random.default_rng(seed)
+    A = 10.0**decades * rng.normal(size=(3, 3))
+    system = plant(states=list("abc"), E=np.eye(3).tolist(), A=A.tolist(), initial_state=[1, 1, 1])
+    mesh = Mesh(np.cumsum([0.0, *10.0 ** rng.uniform(-3.0, 1.0, 6)]), radau_rule(9))
+    known = dense_structure(system, TimeSettings(horizon=float(mesh.edges[-1])), SOLVER)
+    found = _growth_resolved(system, known, mesh, SOLVER)
+    rate = max(0.0, float(np.linalg.eigvals(A).real.max()))
+    assert (found.steps * rate <= 4.0 + 1e-9).all()
+    assert found.size <= np.maximum(1.0, np.ceil(1.02 * mesh.steps * rate / 4.0)).sum()
 
 
 def test_elements_are_short_where_a_state_grows_only():
