@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plants import observed, reference, seen, shipped
+from units import in_units
 
 from gpebo_cli import estimators
 from gpebo_cli import run as experiment
@@ -89,6 +90,23 @@ def test_only_what_constraints_leave_free_at_the_start_is_unknown():
     assert np.abs(residual).max() < 1e-9
     off = estimation.states[0, -1] - found.simulation.states[-1]
     assert np.abs(off).max() < 1e-5
+
+
+def test_what_a_reset_takes_for_rounding_is_the_same_in_any_units():
+    """A share of the largest unknown or state, whichever of them is large in its unit."""
+    content = {
+        "name": "two", "states": ["a", "b"], "outputs": ["y"], "inputs": {"u": "sin(2*t)"},
+        "unknowns": {"k": 0.7}, "E": [[1, 0], [0, 1]], "A": [[-0.1, 1], [-1, -0.2]],
+        "B": [[1], [0]], "F": [[0], [1]], "C": [[1, 0.5]], "initial_state": {"a": 3, "b": -1},
+    }
+    floors = []
+    for states, unknown in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6), (1e-6, 1e-6)):
+        units = np.full(2, states), np.full(1, unknown), np.ones(1), np.ones(1), np.ones(2), 1.0
+        system = plant_from_mapping(in_units(content, units))
+        regression = run(system, remedy="reset", reset_interval=5.0)[1].regression
+        floors.append([reset.floor for reset in regression.resets])
+    assert len(floors[0]) == 3
+    np.testing.assert_allclose(floors[1:], [floors[0]] * 3, rtol=1e-6)
 
 
 def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
