@@ -569,9 +569,9 @@ def test_a_signal_is_not_given_where_it_was_not_kept():
     mesh = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
     kept = mesh.sampled(np.array([0.5, 1.5]), np.array([3.0, 4.0]))
     assert kept(np.array([1.5])) == 4.0
-    for t in (1.0, 2.0):
+    for t in ([1.0], [2.0], [0.5, 1.0]):
         with pytest.raises(ValueError, match="not kept"):
-            kept(np.array([t]))
+            kept(np.array(t))
 
 
 @pytest.mark.parametrize(("grown", "lost"), [([1e-9, 2.0, 5.0], 1), ([0.5, 0.7, 0.9], 3)])
@@ -590,6 +590,16 @@ def test_a_component_that_is_nothing_beside_the_largest_is_not_lost():
         carried = larger * error
         errors = judged_errors(problem, carried[None], carried, 0 * one, size, 0 * one, size)
         assert errors.lost == lost
+
+
+@pytest.mark.parametrize(("factor", "lost"), [(100.0, 1), (1.0, 0)])
+def test_what_constraints_let_through_of_others_is_not_lost(factor, lost):
+    """A component of 1e-13 beside rounding of ``factor`` times the other, and an error of 1e-3."""
+    size, error, one = column(1.0, 1e-13), column(0.0, 1e-3), np.ones((2, 1))
+    amplification = np.array([[0.0, 0.0, 0.0], [factor, 0.0, 0.0]])
+    problem = LinearProblem(lambda t, inside: None, one, units=one, amplification=amplification)
+    errors = judged_errors(problem, error[None], error, 0 * one, size, 0 * one, size)
+    assert errors.lost == lost
 
 
 def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
