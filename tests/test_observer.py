@@ -376,6 +376,7 @@ def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
     found = constant_split(moving / units, tuple("abcd"), units, 1e-10)
     assert found.rank == 2
     assert found.frame is not None
+    assert not found.frame.axes
     P = found.projector[0] * units / units[:, None]
     np.testing.assert_allclose(P @ P, P, atol=1e-12)
     np.testing.assert_allclose(P, P.T, atol=1e-12)
@@ -390,5 +391,6 @@ def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
 
 def test_axes_of_what_is_differentiated_are_exact():
     frame = axes_frame(np.diag([2.0, 0.0, 3.0]))
+    assert frame.axes
     assert frame.domain.tolist() == [[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
     assert frame.kernel.tolist() == [[0.0], [1.0], [0.0]]
