@@ -404,7 +404,7 @@ def test_rounding_at_some_of_the_times_stands_for_that_at_all():
 @pytest.mark.parametrize(("values", "steady", "dips"), [
     ([1.0, 0.5, 0.3, 0.5, 1.0], True, []),  # far above zero,
     ([1.0, 0.5, 0.05, 0.5, 1.0], False, [2]),  # and not, between the ends:
-    ([1.0, 0.03, 0.02, 0.03, 1.0, 0.04, 1.0], False, [5, 2]),  # the sharpest one first
+    ([1.0, 0.03, 0.02, 0.03, 0.05, 0.04, 1.0], False, [5, 2]),  # the sharpest one first
     ([1.0, 0.5, 0.2, 0.1, 0.05], True, [4]),  # towards an end,
     ([0.05, 0.1, 0.2, 0.5, 1.0], True, [0]),
     ([1.0, 0.5, 0.1, 0.05, 5e-3], False, [4]),  # where it is little

@@ -125,6 +125,12 @@ def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
     assert found.mesh.size < 40
     expected = np.stack([step * np.maximum(T - 3.35, 0.0), np.sin(T)], axis=1)
     np.testing.assert_allclose(found.Y(T), expected, atol=1e-10)
+    alone = regression_from_mapping({
+        "name": "r", "unknowns": {"a": 1.0}, "signals": {"u": None},
+        "Y": ["integral(delay(u, 0.35))"], "psi": [[1]],
+    })
+    found, _ = alone.on(Trajectory(mesh, both[..., :1]), None, 1e-12, 1_000)
+    assert np.isin([3.35, 4.35], found.mesh.edges).tolist() == [True, False]
 
 
 def test_delays_that_make_too_many_corners_are_refused():
