@@ -132,6 +132,12 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert not names["Growth of Φ"].holds
     assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
     falls = plant_from_mapping(one_state(A=[[-1]]))
+    equal = found(plant_from_mapping(one_state(
+        states=["a", "b", "c"], E=np.diag([1, 1, 0]).tolist(), C=[[1, 0, 0]],
+        A=[[-1, 0, 0], [0, 0, 1], [1, -1, 0]], initial_state=[1, 1, 0],
+    )), form="strangeness_free")
+    exact = np.sqrt(0.5)  # that of (1, 1)/√2, and it falls
+    assert equal["Growth of Φ"].evidence["largest_entry"] == pytest.approx(exact, rel=1e-9)
     # Of λ at roots of one that of λ + 1 which is largest, at λ = 1.
     assert found(falls)["Regularity"].evidence["largest_smallest_singular_value"] == 2.0
     assert found(falls)["Growth of Φ"].evidence["rate"] == pytest.approx(-1.0, rel=1e-9)

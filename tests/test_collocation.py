@@ -203,6 +203,21 @@ def test_trajectory_samples_integrates_and_filters():
     assert mesh.span == (0.5, 4.5)
 
 
+def test_elements_far_from_zero_are_those_at_zero_later():
+    """Of 1e-4 s at 1e9 s: times beside the origin have digits that times themselves do not."""
+    plain = initial_mesh(0.0, 3.0, [], 3, radau_rule(8))
+    moved = replace(plain, origin=1024.0)
+    t = np.linspace(0.0, 3.0, 31)
+    signals = [Trajectory(mesh, np.sin(plain.points)) for mesh in (plain, moved)]
+    for way in (lambda s, t: s(t), lambda s, t: s(t, t - 0.01), lambda s, t: s.integral()(t),
+                lambda s, t: s.taylor(t, 1)[1], lambda s, t: s.low_pass(2.0)(t)):
+        np.testing.assert_allclose(way(signals[1], 1024.0 + t), way(signals[0], t), atol=1e-12)
+    assert moved.span == (1024.0, 1027.0)
+    np.testing.assert_array_equal(moved.points, 1024.0 + plain.points)
+    np.testing.assert_array_equal(moved.inside, 1024.0 + plain.inside)
+    np.testing.assert_array_equal(moved.split(np.array([1, 2, 1]))[0].span, moved.span)
+
+
 def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():
     mesh = initial_mesh(0.0, 2.0, [1.0], 4, radau_rule(5))
     step = Trajectory(mesh, (mesh.inside > 1.0).astype(float))
@@ -554,9 +569,9 @@ def test_a_signal_is_not_given_where_it_was_not_kept():
     mesh = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
     kept = mesh.sampled(np.array([0.5, 1.5]), np.array([3.0, 4.0]))
     assert kept(np.array([1.5])) == 4.0
-    for t in (1.0, 2.0):
+    for t in ([1.0], [2.0], [0.5, 1.0]):
         with pytest.raises(ValueError, match="not kept"):
-            kept(np.array([t]))
+            kept(np.array(t))
 
 
 @pytest.mark.parametrize(("grown", "lost"), [([1e-9, 2.0, 5.0], 1), ([0.5, 0.7, 0.9], 3)])
@@ -577,6 +592,16 @@ def test_a_component_that_is_nothing_beside_the_largest_is_not_lost():
         assert errors.lost == lost
 
 
+@pytest.mark.parametrize(("factor", "lost"), [(100.0, 1), (1.0, 0)])
+def test_what_constraints_let_through_of_others_is_not_lost(factor, lost):
+    """A component of 1e-13 beside rounding of ``factor`` times the other, and an error of 1e-3."""
+    size, error, one = column(1.0, 1e-13), column(0.0, 1e-3), np.ones((2, 1))
+    amplification = np.array([[0.0, 0.0, 0.0], [factor, 0.0, 0.0]])
+    problem = LinearProblem(lambda t, inside: None, one, units=one, amplification=amplification)
+    errors = judged_errors(problem, error[None], error, 0 * one, size, 0 * one, size)
+    assert errors.lost == lost
+
+
 def test_a_component_with_few_digits_is_vague_by_the_largest_in_its_unit():
     size, one = np.array([[1.0], [1e-11]]), np.ones((2, 1))
     problem = LinearProblem(lambda t, inside: None, one, units=one)
@@ -591,14 +616,14 @@ def column(*values):
 
 def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
     """Three components: a large one, one that is small beside it, one that rounding makes."""
-    own, made_of, one = column(1.0, 1e-5, 0.0), column(1.0, 1e-5, 0.5), np.ones((3, 1))
+    own, made_of, one = column(2.0, 1e-5, 0.0), column(2.0, 1e-5, 0.5), np.ones((3, 1))
     carried = np.array([[[1e-9], [2e-9], [0.0]], [[3e-9], [1e-9], [0.0]]])
     parts = carried.max(axis=0), column(0.0, 0.0, 4e-9), own, column(0.0, 5e-9, 0.0), made_of
     plain = LinearProblem(lambda t, inside: None, one, floor=column(0.0, 0.0, 1e-2))
     in_units = replace(plain, floor=0.0, units=column(1.0, 1e-4, 1.0))
     for problem, size, beside in (
-        (plain, column(1.0, 1e-3, 1e-2), column(1.0, 1e-3, 1e-2)),
-        (in_units, column(1.0, 1e-5, 0.5), column(1.0, 1e-4, 1.0)),
+        (plain, column(2.0, 2e-3, 1e-2), column(2.0, 2e-3, 1e-2)),
+        (in_units, column(2.0, 1e-5, 0.5), column(2.0, 2e-4, 2.0)),
     ):
         errors = judged_errors(problem, carried, *parts)
         np.testing.assert_allclose(errors.largest, column(3e-9, 7e-9, 4e-9), rtol=1e-5)
@@ -650,3 +675,43 @@ def test_errors_of_the_start_are_carried_with_the_solution():
                                          for t in mesh.edges[1:])]
     own = np.abs(found.trajectory.values).max(axis=(0, 1))
     np.testing.assert_allclose((found.errors * own)[:, 0], largest, rtol=1e-5)
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize("rate", [0.0, 1e7])
+def test_solutions_and_their_errors_are_the_same_in_any_units(apart, rate):
+    """Two states and a third that follows fast or, where constraints are ``apart``, at once.
+
+    The second one is nothing beside the first, but for what rounding of that makes of it.
+    """
+    made = []
+    for units in (np.ones((3, 1)), np.array([[2.0**9], [2.0**-9], [2.0**-3]])):
+        def coefficients(t, inside, units=units):
+            n, fast = len(t), max(rate, 1.0)
+            A, f = np.zeros((n, 3, 3)), np.zeros((n, 3, 1))
+            A[:, 0, 0], A[:, 0, 1], A[:, 1, 1] = -1.0, np.cos(3.0 * t), -0.5
+            A[:, 2, 0], A[:, 2, 2], f[:, 2, 0] = fast * np.sin(t), -fast, fast
+            if not apart:
+                return LinearEquation(None, A * units.T**-1 * units, f * units)
+            basis, offset = np.tile(np.eye(3, 2) * units / units[:2].T, (n, 1, 1)), f * units / fast
+            basis[:, 2, 0] = np.sin(t) * (units[2] / units[0])
+            own, E = A[:, :2] / units.T * units[:2], np.broadcast_to(np.eye(2, 3), (n, 2, 3))
+            constraints = Constraints(basis, offset)
+            return LinearEquation(E, own, 0.0 * f[:, :2], (), constraints)
+
+        amplification = np.array([[0.0, 0, 0, 0], [1e6, 0, 0, 1e5], [0, 1e16, 0, 0]])
+        amplification[:, :3] *= units / units.T
+        amplification[:, 3:] *= units
+        problem = LinearProblem(
+            coefficients, np.array([[1.0], [1e-8], [1.0]]) * units, units=units, rate=rate,
+            floor=1e-9 * units, amplification=amplification, uncertain=1e-9 * units,
+        )
+        mesh = initial_mesh(0.0, 4.0, [], 6, radau_rule(9))
+        made.append(solve(problem, mesh, tol=1e-9, max_elements=999))
+        np.testing.assert_allclose(made[0].uncertain, made[-1].uncertain / units, rtol=0.3)
+    one, other = made
+    np.testing.assert_array_equal(one.trajectory.mesh.edges, other.trajectory.mesh.edges)
+    np.testing.assert_allclose(one.errors, other.errors, rtol=0.3)
+    assert one.error_estimate == pytest.approx(other.error_estimate, rel=0.3)
+    assert (one.vague == other.vague).all()
+    assert one.lost is other.lost is None

@@ -52,10 +52,18 @@ def in_basis(system: DescriptorSystem, t: Array, inside: Array, u: Array, y: Arr
     return filter_model(o, signals, EquationForm(system, Units.plain(system))), o.split.basis, o
 
 
-@pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating"])
+DIFFERENCE = {
+    "name": "difference", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+    "E": [[1, -1], [0, 0]], "A": [[-1, 0], [1, 2]], "B": [[1], [1]], "C": [[2, -1]],
+    "unknowns": {"k": 0.5}, "F": [[1], [0]], "initial_state": [1, -0.5],
+}
+
+
+@pytest.mark.parametrize("name", ["circuit", "descriptor", "rotating", "difference"])
 def test_model_holds_on_the_true_state_whatever_the_noise(name):
     """ζ' = 𝔸ζ + b + Γν and z = cζ + Dν for ν that has any value: every sign is right."""
-    system = plant_from_mapping(ROTATING) if name == "rotating" else shipped(name)
+    written = {"rotating": ROTATING, "difference": DIFFERENCE}
+    system = plant_from_mapping(written[name]) if name in written else shipped(name)
     signals = simulate(system, TimeSettings(), SOLVER).signals
     t = np.linspace(1.0, 19.0, 37)
     rng = np.random.default_rng(1)
@@ -91,6 +99,10 @@ def test_model_holds_on_the_true_state_whatever_the_noise(name):
     x = s.offset + np.einsum("nij,nj->ni", s.gain, zeta(t))
     x -= np.einsum("nij,nj->ni", s.direct, nu)
     np.testing.assert_allclose(x, signals.states(t), atol=1e-9 * np.abs(x).max())
+    # What c is made of is the same or more, and more where it cancels.
+    assert (np.sqrt(s.terms) >= (1.0 - 1e-12) * np.abs(s.c)).all()
+    exact = np.abs(o.algebraic) @ np.abs(basis)
+    np.testing.assert_allclose(np.sqrt(s.terms)[..., system.q :], exact, rtol=1e-12)
 
 
 def normalised_errors(name: str, outputs: float, inputs: float, seeds: int) -> tuple[Array, int]:

@@ -17,6 +17,7 @@ from benchmarks import ladders
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import OnDemand
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, initial_mesh
@@ -888,3 +889,17 @@ def test_an_index_above_the_limit_is_refused_at_every_size(n, turned):
     said = r"above 3, for solver\.max_strangeness_index = 2; it seems to be 4: raise that to 3"
     with pytest.raises(ModelError, match=said):
         run(plant, solver={"max_strangeness_index": 2}, **short)
+
+
+def test_an_index_above_the_limit_of_a_large_full_plant_is_refused():
+    n, rng = 51, np.random.default_rng(2)
+    rows, columns = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+    E = np.diag(np.arange(n) > 1.0) + np.eye(1, n, 1).T * np.eye(1, n)  # 0 = x0, x0' = x1
+    plant = plant_from_mapping({
+        "name": "full", "states": [f"x{k}" for k in range(n)], "E": rows @ E @ columns,
+        "A": rows @ columns, "initial_state": np.zeros(n),
+    })
+    limits = TimeSettings(horizon=1.0), SolverSettings(max_strangeness_index=1)
+    assert large.structure_of(plant, *limits).index == 2
+    with pytest.raises(ModelError, match="it seems to be 2: raise that to 1"):
+        large.structure_of(plant, limits[0], SolverSettings(max_strangeness_index=0))

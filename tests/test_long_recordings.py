@@ -325,8 +325,13 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
         np.savetxt(file, table, delimiter=",", header="t,current,v", comments="")
     with pytest.raises(ConfigError, match="1025 samples would take some"):
         run("battery", data={"file": files})
-    # Those that go on from window to window are there each by itself and, wider, all together.
+    # Those that go on from window to window are there each by itself and, wider, all together; in
+    # current coordinates there are dynamics beside the regression.
     monkeypatch.setattr(gpebo, "_LONG", 32)
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 2e-3)
+    given = {"data": data, "time": {"samples": 41}, "estimator": "least_squares"}
+    with pytest.raises(ConfigError, match=r"would take some 0\.00267 GB .*horizon=30 fits"):
+        run("battery", **given, observer={"remedy": "current_coordinates"})
     monkeypatch.setattr("gpebo_cli.errors._MOST", 5e-4)
     sizes = []
     for some in (files[:1], files):

@@ -132,5 +132,15 @@ def test_a_stiff_mode_hides_no_constraint(seed, nu, decades):
 def test_what_rounding_leaves_nothing_of_is_refused_for_that():
     """Index 4 needs powers of the rate that doubles do not hold."""
     case = made(np.random.default_rng(5), 6, 4, dynamics=np.diag([-1e7, -1.0]))
-    with pytest.raises(ModelError, match="leaves no digit of its hidden constraints"):
-        simulate(case.system, TimeSettings(horizon=5.0), SolverSettings())
+    rng = np.random.default_rng(0)
+    Q, T = rng.normal(size=(2, 5, 5))
+    E, A = np.diag([1.0, 1.0, 0.0, 0.0, 0.0]) + np.diag([0.0, 0.0, 1.0, 1.0], -1), np.eye(5)
+    A[0, 0], A[1, 1] = -1e7, -1.0
+    constant = plant_from_mapping({
+        "name": "constant", "states": [f"x{i}" for i in range(5)], "inputs": {"u": "sin(t)"},
+        "E": (Q @ E @ T).tolist(), "A": (Q @ A @ T).tolist(), "B": np.ones((5, 1)).tolist(),
+        "initial_state": [0.0] * 5,
+    })
+    for system in (case.system, constant):
+        with pytest.raises(ModelError, match="leaves no digit of its hidden constraints"):
+            simulate(system, TimeSettings(horizon=5.0), SolverSettings())

@@ -117,9 +117,13 @@ def test_what_still_changes_is_measured_by_the_residual():
     )
     change = _change(SimpleNamespace(regression=made), np.array([3.1]), np.array([3.0]), 0.0)
     assert change == pytest.approx(0.1 * np.sqrt(2.0), rel=0.02)
-    exact = replace(made, Y=Trajectory(made.mesh, 3.0 + 0.0 * made.Y.values))
+    wave = np.cos(made.mesh.points)[..., None]
+    exact = replace(
+        made, Y=Trajectory(made.mesh, 3.0 * wave), psi=Trajectory(made.mesh, wave[..., None])
+    )
     change = _change(SimpleNamespace(regression=exact), np.array([3.1]), np.array([3.0]), 1e-6)
-    assert change == pytest.approx(0.1 / (1e-6 * 6.0 / 1e-3))  # rounding is no residual
+    rounding = 1e-6 * (3.0 + 3.0) / 1e-3  # is no residual
+    assert change == pytest.approx(0.1 / np.sqrt(2.0) / rounding, rel=0.02)
 
 
 def test_a_copy_that_does_not_settle_is_refused(monkeypatch):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from plants import observed, reference, seen, shipped
+from units import in_units
 
 from gpebo_cli import estimators
 from gpebo_cli import run as experiment
@@ -14,6 +15,7 @@ from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
+from gpebo_cli.observers.reduced.regression import Assembled
 from gpebo_cli.observers.reduced.split import axes_frame, constant_split
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -76,6 +78,37 @@ def test_regression_holds_with_the_true_parameters(name):
     np.testing.assert_allclose(e0, expected["e0"], atol=1e-12)
 
 
+def test_only_what_constraints_leave_free_at_the_start_is_unknown():
+    """The voltage e1 is that of the source, which E does not know: its rank is 3."""
+    found = experiment(
+        "circuit", observer={"name": "gpebo", "form": "strangeness_free"},
+        estimator="least_squares", time={"horizon": 5.0, "samples": 101},
+    ).details
+    regression, estimation = found.regression, found.estimation
+    assert estimation.names == ("e0_e2", "e0_il")
+    residual = regression.Y - regression.psi @ estimation.true_parameters[-1]
+    assert np.abs(residual).max() < 1e-9
+    off = estimation.states[0, -1] - found.simulation.states[-1]
+    assert np.abs(off).max() < 1e-5
+
+
+def test_what_a_reset_takes_for_rounding_is_the_same_in_any_units():
+    """A share of the largest unknown or state, whichever of them is large in its unit."""
+    content = {
+        "name": "two", "states": ["a", "b"], "outputs": ["y"], "inputs": {"u": "sin(2*t)"},
+        "unknowns": {"k": 0.7}, "E": [[1, 0], [0, 1]], "A": [[-0.1, 1], [-1, -0.2]],
+        "B": [[1], [0]], "F": [[0], [1]], "C": [[1, 0.5]], "initial_state": {"a": 3, "b": -1},
+    }
+    floors = []
+    for states, unknown in ((1.0, 1.0), (1e6, 1.0), (1.0, 1e6), (1e-6, 1e-6)):
+        units = np.full(2, states), np.full(1, unknown), np.ones(1), np.ones(1), np.ones(2), 1.0
+        system = plant_from_mapping(in_units(content, units))
+        regression = run(system, remedy="reset", reset_interval=5.0)[1].regression
+        floors.append([reset.floor for reset in regression.resets])
+    assert len(floors[0]) == 3
+    np.testing.assert_allclose(floors[1:], [floors[0]] * 3, rtol=1e-6)
+
+
 def test_what_an_observer_estimates_itself_is_no_affine_map_of_the_regression():
     _, observation, _ = run(shipped("descriptor"))
     assert observation.of_constants is observation.state_map
@@ -111,6 +144,45 @@ def test_literal_regressor_is_lossless_where_A22_is_invertible():
     np.testing.assert_allclose(paper.regression.Y(T), paper.regression.psi(T) @ truth, atol=1e-9)
     rank = [np.linalg.matrix_rank(o.regression.gram.final[:, :-1], tol=1e-9) for o in (ours, paper)]
     assert rank == [4, 4]
+
+
+@pytest.mark.parametrize("of_states", [np.ones(5), 10.0 ** np.array([3, -4, 0, 5, -2])])
+@pytest.mark.parametrize("of_parameters", [np.ones(3), np.array([1e-3, 1e5, 1.0])])
+@pytest.mark.parametrize("offset", [True, False])
+def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_parameters, offset):
+    """Each state's gain beside the largest of itself and small shares of what it is made of.
+
+    That is itself, the offset, what the gain of w is and what rounding leaves of it; the last state
+    has no size. ψ has a column that vanishes.
+    """
+    rng, t = np.random.default_rng(0), np.linspace(0.0, 3.0, 7)
+    unit = of_states[:, None] / of_parameters
+    wave = np.cos(t[:, None, None] + np.arange(3.0))
+    gain = np.array([2.0, 1e-9, 1e-9, 1e-9, 0.0])[:, None] * wave * [1.0, 3.0, 0.0]
+    moving = np.array([[1.0, 1, 0], [1, 0, 0], [50, 0, 0], [0, 0, 0], [0, 0, 0]])
+    rounding = np.zeros((5, 5))
+    rounding[3, 2] = 0.1
+    psi, columns = rng.normal(size=(7, 2, 3)) * [1.0, 5.0, 0.0], np.array([1.0, 5.0, 0.0])
+    x = np.array([0.0, 40.0, 0.0, 0.0, 0.0]) * np.cos(t)[:, None] * offset
+    Y = (4.0 * np.sin(t)[:, None] + np.zeros(2)) * offset
+    found = Assembled(
+        Y, psi / of_parameters, x * of_states, gain * unit, 4.0 * offset, columns / of_parameters,
+        np.zeros(5, dtype=bool), np.ones((5, 4)), moving * unit,
+    )
+    by = rounding * of_states[:, None] / of_states
+    rows, regressor, states, gains, squares, products = found.kinds(of_states, None, by)
+    each = np.array([1.0, 5.0, 1.0])
+    largest = (np.abs(gain).max(axis=0) / each).max(axis=1)
+    sizes = np.array([largest[0], 1e-3 * (10.0 if offset else 1.0), 0.05, 5.0, 1.0])
+    for (value, floor), exact, least in (
+        (rows, Y, 4e-3 * offset), (regressor, psi / each, 1e-3), (states, x, 0.0),
+        (gains, gain / sizes[:, None] / each, 0.0),
+        (squares, ((psi / each) ** 2).sum(axis=1), 1e-3),
+        (products, np.einsum("nrp,nr->np", psi / each, Y), 4e-3 * offset),
+    ):
+        np.testing.assert_allclose(value, exact, rtol=1e-12, atol=1e-300)
+        assert floor == pytest.approx(least)
+    assert found.lost(by) == pytest.approx(5.0 / largest[3])
 
 
 def random_block_system(rng, n_a, n_b, r, q, varying):
@@ -304,6 +376,7 @@ def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
     found = constant_split(moving / units, tuple("abcd"), units, 1e-10)
     assert found.rank == 2
     assert found.frame is not None
+    assert not found.frame.axes
     P = found.projector[0] * units / units[:, None]
     np.testing.assert_allclose(P @ P, P, atol=1e-12)
     np.testing.assert_allclose(P, P.T, atol=1e-12)
@@ -318,5 +391,6 @@ def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
 
 def test_axes_of_what_is_differentiated_are_exact():
     frame = axes_frame(np.diag([2.0, 0.0, 3.0]))
+    assert frame.axes
     assert frame.domain.tolist() == [[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]]
     assert frame.kernel.tolist() == [[0.0], [1.0], [0.0]]

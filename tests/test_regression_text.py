@@ -74,6 +74,7 @@ def test_a_delay_moves_jumps_exactly():
 
 @pytest.mark.parametrize(("along", "of_time"), [
     ("integral(sign(u))", "integral(sign(sin(t)))"),
+    ("1e9*integral(1e-9*sign(u))", "integral(sign(sin(t)))"),
     ("integral(sign((u - 0.3)*(u - 0.3001)))", "integral(sign((sin(t) - 0.3)*(sin(t) - 0.3001)))"),
     ("lp(sign(lp(u, 2)), 5)", "lp(sign(4*sin(t) - 2*cos(t) + 2*exp(-2*t)), 5)"),
     ("integral(delay(sign(u - 0.5), 1))", "integral(sign(sin(t - 1) - 0.5)*step(t - 1))"),
@@ -102,6 +103,14 @@ def test_it_does_not_matter_when_a_run_starts(start):
         )
 
 
+def test_columns_in_any_unit_take_the_same_elements():
+    texts = ["1e-12/(1.01 - u)", "1/(1.01 - u)", "1e9/(1.01 - u)"]
+    rest = {"unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": [1]}
+    small, one, large = (on_mesh({**rest, "psi": [[text]]}) for text in texts)
+    assert small.mesh.size == one.mesh.size == large.mesh.size
+    np.testing.assert_allclose(one.psi(T)[:, 0, 0], 1.0 / (1.01 - np.sin(T)), rtol=1e-9)
+
+
 @pytest.mark.parametrize("step", [1.0, -1.0])
 def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
     """At an edge of its elements, up or down, while another signal is smooth."""
@@ -116,6 +125,12 @@ def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
     assert found.mesh.size < 40
     expected = np.stack([step * np.maximum(T - 3.35, 0.0), np.sin(T)], axis=1)
     np.testing.assert_allclose(found.Y(T), expected, atol=1e-10)
+    alone = regression_from_mapping({
+        "name": "r", "unknowns": {"a": 1.0}, "signals": {"u": None},
+        "Y": ["integral(delay(u, 0.35))"], "psi": [[1]],
+    })
+    found, _ = alone.on(Trajectory(mesh, both[..., :1]), None, 1e-12, 1_000)
+    assert np.isin([3.35, 4.35], found.mesh.edges).tolist() == [True, False]
 
 
 def test_delays_that_make_too_many_corners_are_refused():

@@ -112,16 +112,20 @@ def test_the_regression_of_the_paper_has_the_last_rows_at_samples_too():
 
 
 def test_a_turning_kernel_of_e():
-    system = plant_from_mapping(ROTATING)
-    reference = run(system, {"name": "least_squares"}).estimation.parameters[0, -1]
-    errors = [
-        np.abs(
-            run(system, {"name": "least_squares"}, sample_time=step, hold="linear")
-            .estimation.parameters[0, -1] - reference
-        ).max()
+    """Of unknowns in small units, too: what is excited is told without any."""
+    system = plant_from_mapping({
+        **ROTATING, "F": [[f"1e-6*({x})" for x in row] for row in ROTATING["F"]],
+        "unknowns": {name: 1e6 * value for name, value in ROTATING["unknowns"].items()},
+    })
+    reference = run(system, {"name": "least_squares"})
+    found = [
+        run(system, {"name": "least_squares"}, sample_time=step, hold="linear")
         for step in (0.02, 0.01)
     ]
+    exact, *ends = (one.estimation.parameters[0, -1] for one in (reference, *found))
+    errors = [np.abs(end / exact - 1.0).max() for end in ends]
     assert errors[1] < 0.35 * errors[0]
+    assert found[1].excitation.level == pytest.approx(reference.excitation.level, rel=1e-3)
 
 
 def test_a_kernel_of_e_that_turns_later():

@@ -24,7 +24,8 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.simulate import simulate
+from gpebo_cli.simulation.large import dense_structure
+from gpebo_cli.simulation.simulate import _growth_resolved, simulate
 
 SOLVER = SolverSettings()
 
@@ -100,15 +101,20 @@ def test_an_explicit_ode_has_index_zero():
     assert result.signals.states(np.array([2.0]))[0, 0] == pytest.approx(0.5, abs=1e-12)
 
 
-@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456])
+@pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456, 0.0011, 0.9989])
 def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
     """A probe next to the zero may lie lower than all times of the first closer look."""
-    singular = plant(
-        states=["a", "b"], E=[[1, 0], [0, f"t - {where}"]], A=[[-1, 0], [0, -1]],
-        initial_state=[1, 1],
-    )
-    with pytest.raises(ModelError, match=rf"rank of the derivative array changes at t = {where}"):
-        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+    row = [0, f"t - {where}"]
+    for of, E, A in (
+        ("derivative array", [[1, 0], row], [[-1, 0], [0, -1]]),
+        ("constraints", [[1, 0], [0, 0]], [[-1, 0], row]),
+    ):
+        singular = plant(states=["a", "b"], E=E, A=A, initial_state=[1, 1])
+        said = rf"rank of the {of} changes at t = ([\d.]+) "
+        with pytest.raises(ModelError, match=said) as refusal:
+            simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+        told = float(re.search(said, str(refusal.value))[1])
+        assert told == pytest.approx(where, abs=1e-8)
 
 
 @pytest.mark.parametrize("bottom", [2e-10, 0.0])
@@ -664,6 +670,31 @@ def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monk
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state=[0])
     with pytest.raises(SolverError, match=why):
         simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
+
+
+@settings(max_examples=8, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-2.0, 2.0))
+def test_no_state_grows_much_within_an_element_and_no_more_are_cut(seed, decades):
+    """By e^4 at most, of elements of any lengths."""
+    rng = np.random.default_rng(seed)
+    A = 10.0**decades * rng.normal(size=(3, 3))
+    system = plant(states=list("abc"), E=np.eye(3).tolist(), A=A.tolist(), initial_state=[1, 1, 1])
+    mesh = Mesh(np.cumsum([0.0, *10.0 ** rng.uniform(-3.0, 1.0, 6)]), radau_rule(9))
+    known = dense_structure(system, TimeSettings(horizon=float(mesh.edges[-1])), SOLVER)
+    found = _growth_resolved(system, known, mesh, SOLVER)
+    rate = max(0.0, float(np.linalg.eigvals(A).real.max()))
+    assert (found.steps * rate <= 4.0 + 1e-9).all()
+    assert found.size <= np.maximum(1.0, np.ceil(1.02 * mesh.steps * rate / 4.0)).sum()
+
+
+def test_elements_are_short_where_a_state_grows_only():
+    """By e^53 within 0.02 s: everywhere as short, they would be 7500."""
+    system = plant(
+        states=["x"], E=[[1]], A=[["3000*exp(-((t - 5)/0.01)**2)"]], initial_state=[1],
+    )
+    states = simulate(system, TimeSettings(horizon=10.0), SOLVER).signals.states
+    assert np.log(states.final[0]) == pytest.approx(30.0 * np.sqrt(np.pi), rel=1e-9)
+    assert states.mesh.size < 2100
 
 
 def test_a_rank_that_a_step_changes_is_named_with_what_vanishes():

@@ -309,6 +309,23 @@ def test_signals_are_taken_at_the_time_itself_but_where_something_switches():
     assert (side == np.sign(inside[passed] - linear.switched)).all()
 
 
+def test_a_difference_does_not_pass_a_jump():
+    """Beside y = 0 the slope of -|y| x - sign(y)/2 with respect to y is that of one side."""
+    plant = plant_from_mapping({
+        "name": "jump", "states": ["x"], "inputs": {"u": "exp(3*t)"}, "outputs": ["y"],
+        "E": [[1]], "A": [["-abs(y)"]], "phi": ["u - 0.5*sign(y)"], "C": [[1]],
+        "initial_state": [-1.0],
+    })
+    states = simulate(plant, TimeSettings(horizon=2.0), SOLVER).signals.states
+    linear, mesh = Linearised(plant, states), states.mesh
+    t, inside = mesh.points.ravel(), mesh.inside.ravel()
+    x = states(t, inside)[:, 0]
+    assert (np.abs(x) < 1e-9).any()
+    np.testing.assert_allclose(
+        linear.taylor(t, 0, inside).A[0, :, 0, 0], -2.0 * np.abs(x), atol=1e-6
+    )
+
+
 def test_an_output_may_switch_together_with_a_function_of_time():
     """Both instants differ by rounding: an element's last node was on the wrong side of one."""
     x1, x2 = "sin(1.3829*t + 1.4984)", "(cos(1.2204*t + 3.8077) + 0.3)"
