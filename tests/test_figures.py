@@ -264,6 +264,14 @@ def test_without_mixing_there_is_no_delta() -> None:
     assert "delta" not in dict(draw(make_result(samples=51, mixing=False)))
 
 
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_each_parameter_has_its_eigenvalue(count: int) -> None:
+    result = make_result(samples=51, parameters=("e0_e1", "e0_e2")[:count])
+    (panel, *_) = describe(result, ["gram"]).get("gram", [None])
+    assert (panel is None) == (count == 0)
+    assert panel is None or len(panel.curves) == count + 1
+
+
 EIGENVALUES = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
 
 

@@ -360,8 +360,10 @@ def test_suffixes(text, value):
 
 
 def test_what_continues_and_what_is_a_comment():
-    netlist = read_netlist("title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n")
+    text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n"
+    netlist = read_netlist(text)
     assert [(e.name, e.value) for e in netlist.elements.values()] == [("C1", 1.0), ("R1", 5.0)]
+    assert netlist.title == "a title"
 
 
 @pytest.mark.parametrize(("lines", "message"), [

@@ -309,6 +309,10 @@ def test_a_state_that_is_known_without_outputs_has_no_part_in_how_deviations_fal
     falls = [(sensor.fall, sensor.fall_together) for sensor in found]
     np.testing.assert_allclose(falls, np.sqrt([[2.0, 2.0], [1.0, 2.0]]), rtol=1e-9)
     assert [sensor.gained for sensor in found] == [(), ()]
+    twice = plant | {"states": ["a"], "inputs": {}, "outputs": ["y", "z"], "E": [[1]], "A": [[-1]],
+                     "B": [], "C": [[1], [1]], "initial_state": [1]}
+    (third,) = candidates(Settings({}, TimeSettings(horizon=5.0)), plant_from_mapping(twice))
+    assert third.fall == pytest.approx(np.sqrt(1.5))
     for other in (Settings({}, observer={"name": "none"}), Settings({}, data=DataSettings("csv"))):
         with refused("sensors=all needs a simulation of a plant"):
             candidates(other, plant_from_mapping(plant))
