@@ -225,6 +225,8 @@ def test_without_an_observer_there_are_signals_only(tmp_path):
     assert (result.parameters, result.excitation, result.estimates_t.shape) == ({}, None, (0,))
     with pytest.raises(ConfigError, match="made with observer=none"):
         result.to_pandas("estimates")
+    with pytest.raises(ConfigError, match="there is no table 'estimate'.*did you mean estimates"):
+        result.to_pandas("estimate")
     assert len(result.plot().axes) >= 1
     assert [p.name for p in result.save(tmp_path / "o", figures=False).glob("*.csv")] == [
         "signals.csv"

@@ -537,7 +537,9 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"measure": "q1"}, "measure: expected a list"),
     ({"inputs": ["u"]}, "inputs: expected a mapping of names"),
     ({"K": 3}, "K: expected a list"), ({"K": [1, 2]}, "K[0]: expected a list"),
-    ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
+    ({"M": [[0]] * 1001}, "M has 1001 rows and G 1; 1 to 1000 are read"),
+    ({"M": []}, "M has 0 rows"), ({"G": [[1, -1]] * 1001}, "M has 2 rows and G 1001;"),
+    ({"units": "m"}, "units: expected a mapping"),
 ])
 def test_mistakes_in_mechanics(change, message):
     with refused(message):

@@ -629,6 +629,9 @@ def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
         built = estimators.build({"name": name})
         assert isinstance(built, estimators.Recursive)
         assert not built.recursive(["a", "b", "c"]).requirement.holds, name
+    bounded = estimators.build({"name": "least_squares", "f0": 1.0, "beta": 1.0, "bound": 9.0})
+    with pytest.raises(ConfigError, match=r"^estimator\.bound works in continuous time only; at "):
+        bounded.recursive(["a"])
     with pytest.raises(ConfigError, match=r"these can: annihilator, drem, exciting, .*, lion"):
         estimators.able(object(), estimators.Recursive, "samples")
 
