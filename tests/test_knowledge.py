@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,12 @@ F: [[1, 0], [0, 0], [0, 1]]
 C: [[1, 0, 0]]
 initial_state: {a: 1, b: 0.5, c: 2}
 """
+WHOLE = yaml.safe_load(HALF_SEEN)
+ALONE = {  # what the output sees of it
+    **WHOLE, "states": ["a", "b"], "unknowns": {"k1": 2.0}, "E": [[1, 0], [0, 1]],
+    "A": [[-1, 1], [0, -0.5]], "B": [[1], [0]], "F": [[1], [0]], "C": [[1, 0]],
+    "initial_state": {"a": 1, "b": 0.5},
+}
 SEEN, UNSEEN = {"a", "b", "k1", "e0_a", "e0_b"}, {"c", "k2", "e0_c"}
 
 
@@ -222,6 +229,37 @@ def test_a_run_goes_on_without_what_is_not_determined(half_seen):
     rows = rows_of(half_seen / "out" / "cases.csv")
     times = {name: rows[0][f"seconds_to_1pct_{name}"] for name in SEEN | UNSEEN}
     assert {name for name, time in times.items() if time} == SEEN
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])
+def test_what_is_seen_is_estimated_as_if_there_were_nothing_else(observer):
+    """The same deviations as of a, b and k1 alone; a gain for each parameter is that of all."""
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.1}
+    given = {"observer": observer, "noise": noise, "time": {"horizon": 5.0, "samples": 51}}
+    gains = dict.fromkeys(("k1", "k2", "e0_a", "e0_b", "e0_c"), 100.0)
+    for of, one, other in (
+        (("hat", "std"), run(WHOLE, estimator="ls_drem", **given),
+         run(ALONE, estimator="ls_drem", **given)),
+        (("hat",), run(WHOLE, estimator="gradient", gamma=gains, **given),
+         run(WHOLE, estimator="gradient", gamma=100.0, **given)),
+    ):
+        mine, theirs = (result.to_pandas("estimates") for result in (one, other))
+        names = [f"{name}_{kind}" for name in sorted(SEEN) for kind in of]
+        np.testing.assert_allclose(mine[names], theirs[names], rtol=1e-6, atol=1e-9)
+
+
+def test_statistics_over_seeds_are_those_of_the_parameters_that_are_seen():
+    """As of a, b and k1 alone; of what is not determined there are none."""
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.1, "seeds": 3}
+    given = {"estimator": "ls_drem", "noise": noise, "time": {"horizon": 5.0, "samples": 51}}
+    mine, theirs = (run(plant, **given).details.noise for plant in (WHOLE, ALONE))
+    seen = [name in SEEN for name in mine.names]
+    assert tuple(compress(mine.names, seen)) == theirs.names
+    for name in ("truth", "bias", "deviation", "rms"):
+        np.testing.assert_allclose(getattr(mine, name)[..., seen], getattr(theirs, name), rtol=1e-5)
+    assert (mine.deviation[:, seen] > 0.0).all()
+    for name in ("bias", "deviation", "rms"):
+        assert np.isnan(getattr(mine, name)[:, ~np.array(seen)]).all()
 
 
 def test_what_is_not_determined_is_dashed_in_the_figures():
