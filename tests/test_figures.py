@@ -409,6 +409,26 @@ def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
 
 
+@pytest.mark.parametrize(("settled", "names"), [
+    (None, ["final error", "time to 1 %"]), ({}, ["final error"]),
+    ({"il": np.array([np.nan, 3.0, 2.0]), "iv": np.array([np.nan, 1.0, 4.0])},
+     ["final error", "time to ±2σ"]),
+])
+def test_under_noise_the_time_to_settle_stands_for_that_to_one_percent(
+    settled: Any, names: list[str]
+) -> None:
+    """Of the last quantity, over the gain; where nobody knows it there is no panel."""
+    result = make_result((1e10, 1e8, 1e6), samples=11)
+    assert result.metrics is not None
+    result = replace(result, metrics=replace(result.metrics, seconds_to_settled=settled))
+    panels = describe(result, ["gains"])["gains"]
+    assert [panel.name for panel in panels] == names
+    if settled:
+        (curve,) = panels[1].curves
+        np.testing.assert_array_equal(curve.x, [1e6, 1e8, 1e10])
+        np.testing.assert_array_equal(curve.y, [4.0, 3.0, np.nan])
+
+
 @pytest.mark.parametrize(("gammas", "bands"), [((1e10,), 1), ((1e10, 1e8), 0)])
 def test_deviations_are_drawn_about_a_single_case(gammas: tuple[float, ...], bands: int) -> None:
     result = make_result(gammas, samples=11)

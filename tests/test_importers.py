@@ -251,6 +251,8 @@ def damped(t, since):
      - 2 * -np.expm1(-(t - 2).clip(0) / 0.3)),
     ("PWL(0.5 1 1 3 1 -1 2 4)", lambda t: np.interp(
         t, [0.5, 1, np.nextafter(1, 2), 2], [1, 3, -1, 4])),
+    ("PULSE(0 1 0 0.5 0.5 0.5 1.5 2)", lambda t: np.interp(  # one right after the other
+        t, [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0])),
     ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),

@@ -12,7 +12,7 @@ from gpebo_cli import estimators, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
-from gpebo_cli.evidence.groups import grouped
+from gpebo_cli.evidence.groups import each_alone, grouped
 from gpebo_cli.experiment.fit import _follows, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
@@ -274,6 +274,7 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     edges = np.sort(np.append(samples, jump))
     rows = Rows(samples)
     groups = grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
+    assert [found.alone for found in (groups, each_alone(rows, np.zeros(1)))] == [False, True]
     mesh = uncertainty._mesh(edges, groups, edges[:1])
     fresh = np.diff(uncertainty._group_of(mesh, groups.starts), prepend=-1) > 0
     expected = np.union1d(groups.starts, [jump, 100.0])

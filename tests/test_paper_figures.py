@@ -364,6 +364,10 @@ def test_curves_that_come_go_or_end_are_differences(tmp_path: Path) -> None:
     ended = Curve(t, np.where(t > 0.5, np.nan, t), "a", line(0))
     [text] = compare([Panel("y", (ended,))], [Panel("y", (curves[0],))], tmp_path)
     assert "it is nan" in text
+    other = replace(curves[0], x=t**2, y=t**2)
+    assert compare([Panel("y", (other,))], [Panel("y", (curves[0],))], tmp_path) == [
+        "t does not have the values of the reference among its own"
+    ]
 
 
 def test_a_changed_table_fails_the_check(tmp_path: Path) -> None:

@@ -623,12 +623,25 @@ def test_the_power_law_at_samples_needs_what_its_start_is_off():
         })
 
 
+def test_the_level_that_is_asked_for_is_reached_at_a_sample():
+    found = gpebo_cli.run(
+        "circuit", observer={"sample_time": 0.1}, excitation={"rho": 1e-3}, estimator="ls_drem",
+        time={"samples": 201},
+    ).details.excitation
+    reached = found.t[found.gram_eigenvalues[:, 0] >= 1e-3]
+    assert found.t_c == reached[0] > found.t[1]
+
+
 def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
     """Before the first sample none of them has what it requires."""
     for name in estimators.names():
         built = estimators.build({"name": name})
         assert isinstance(built, estimators.Recursive)
-        assert not built.recursive(["a", "b", "c"]).requirement.holds, name
+        requirement = built.recursive(["a", "b", "c"]).requirement
+        assert not requirement.holds, name
+        (reached,) = {"left_of_the_initial_error", "gamma_times_integral",
+                      "alpha_lambda_min_over_f0"} & set(requirement.evidence)
+        assert requirement.evidence[reached] == float(reached.startswith("left"))
     bounded = estimators.build({"name": "least_squares", "f0": 1.0, "beta": 1.0, "bound": 9.0})
     with pytest.raises(ConfigError, match=r"^estimator\.bound works in continuous time only; at "):
         bounded.recursive(["a"])
