@@ -68,7 +68,8 @@ def test_a_line_begins_with_the_command_whatever_its_name(command, capsys):
 
 def test_values_of_ones_own_folder(here):
     assert "plant=mine" not in names("run", "plant=")
-    for words in (["--config-dir", "."], ["--config-dir=."], ["-cd", str(here)]):
+    for words in (["--config-dir", "."], ["--config-dir=."], ["-cd", str(here)],
+                  ["-m", "time.samples=11", "-cd", "."]):
         assert names("run", *words, "plant=mi") == ["plant=mine"]
 
 

@@ -20,8 +20,8 @@ from matplotlib.text import Text
 from PIL import Image
 
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.experiment.result import EstimationResult, RunResult
-from gpebo_cli.results import style, symbols
+from gpebo_cli.experiment.result import EstimationResult, Fit, RunResult
+from gpebo_cli.results import figures, style, symbols
 from gpebo_cli.results.figures import FIGURES, describe, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
@@ -407,6 +407,28 @@ def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     noisy = replace(result, simulation=replace(result.simulation, measured_outputs=measured))
     _, outputs = describe(noisy, ["signals"])["signals"]
     assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
+
+
+def test_a_residual_is_what_was_measured_less_what_is_fitted() -> None:
+    result = make_result(samples=11)
+    fit = Fit(np.ones(1), 1.0, 1.0, outputs=result.signals.outputs - 0.25)
+    outputs, residual = describe(replace(result, fit=fit), ["fit"])["fit"]
+    assert [curve.label for curve in outputs.curves] == ["y measured", "y fitted"]
+    np.testing.assert_allclose(residual.curves[0].y, 0.25)
+    assert (residual.name, residual.unit) == ("residual of y", "A")
+
+
+@pytest.mark.parametrize("errors", [("log", "log"), ("log", "linear"), ("linear", "log")])
+def test_errors_of_several_runs_are_on_a_logarithmic_axis_if_all_of_them_are(
+    errors: tuple[str, str]
+) -> None:
+    result = make_result(samples=11)
+    outputs = [OutputSettings(error=error) for error in errors]
+    runs = [replace(result, settings=replace(result.settings, output=own)) for own in outputs]
+    panels = figures._norm_panels([("", own, 0) for own in runs])
+    assert {panel.log for panel in panels} == {"linear" not in errors}
+    nobody = without_observer(result)
+    assert figures._norm_panels([("", nobody, 0)]) == []
 
 
 @pytest.mark.parametrize(("settled", "names"), [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -24,6 +25,7 @@ from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import NoiseStatistics
 from gpebo_cli.results import document, html
 from gpebo_cli.results.folder import write_run
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.report import case_table, estimate_table, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
@@ -68,6 +70,7 @@ def test_an_estimate_stands_since_it_is_within_a_hundredth_of_its_end():
 def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     head, *rows = case_table(make_result(gammas=tuple(range(1, count + 1)), samples=5))
     told = [row.split()[0] for row in rows if "…" not in row]
+    assert re.split(" {2,}", head.strip())[1:] == list(METRICS.values())[:4]
     assert head.split()[0] == "gamma"
     assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
     assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])

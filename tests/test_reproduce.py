@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import yaml
 from examples import ROOT, gpebo
@@ -65,6 +67,8 @@ def test_a_page_and_its_pictures_are_written(tmp_path, monkeypatch, capsys):
 def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     found = reproduce.Finding("r", "t", "s", "last.x", 1.0, 1.1, 0.05, "page 3")
     monkeypatch.setattr(reproduce, "reproduced", lambda name, options, pictures: [found])
+    near = [replace(found, ours=ours).holds for ours in (None, 0.94, 0.96, 1.04, 1.06)]
+    assert near == [True, False, True, True, False]
     assert reproduce.main(["gelda"]) == 1
     out = capsys.readouterr().out
     assert "OFF by 0.1" in out
