@@ -419,6 +419,17 @@ def test_noise_in_the_matrices_is_named_and_may_be_taken_out():
     assert "in the matrices" not in wrong
 
 
+def test_at_samples_estimates_are_as_far_from_least_squares_as_in_continuous_time():
+    """Of parameters and of states at the end, which a drift has moved since the start."""
+    given = {"estimator": "gradient", "gamma": 1e-3, "time": {"samples": 201}}
+    found = [
+        run("battery", observer=observer, **given).details.estimation.doubts[0]
+        for observer in ({}, {"sample_time": 0.05})
+    ]
+    assert found[1] == pytest.approx(found[0], rel=0.05, abs=1e-3)
+    assert max(found[0].values()) > 0.5
+
+
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])
 def test_a_law_that_is_not_done_is_no_fault_of_the_model(observer):
     """Least squares of the same data explain them; what γ leaves is not a sensor that fails."""
