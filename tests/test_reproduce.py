@@ -76,6 +76,20 @@ def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     assert_refused(gpebo("reproduce", "geldaa", cwd=tmp_path), "did you mean gelda?")
 
 
+def test_quantities_are_those_of_signals_estimates_and_cases():
+    from gpebo_cli import run
+
+    result = run("circuit", estimator="drem", gamma=[1e8, 1e10],
+                 time={"horizon": 1, "samples": 11}).details
+    x, found = result.signals.states[:, 1], result.estimation
+    for name, values in (
+        ("first.e2", [x[0]]), ("last.e2", [x[-1]]), ("max.e2", [x.max()]), ("min.e2", [x.min()]),
+        ("final.e2", found.states[:, -1, 1]), ("final.e0_e2", found.parameters[:, -1, 1]),
+        ("case.final_error_states", result.metrics.final_error_states),
+    ):
+        assert reproduce.quantity(result, name, "recipe") == list(values), name
+
+
 def test_a_quantity_that_is_none_names_those_there_are():
     from gpebo_cli import run
 
