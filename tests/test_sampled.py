@@ -299,6 +299,17 @@ def test_assumption_1_is_judged_by_its_weakest_sample():
     assert one.evidence["smallest_singular_value_at_least"] == pytest.approx(smallest, rel=1e-4)
 
 
+def test_a_parameter_alone_would_explain_the_data_at_samples_with_its_size():
+    system, t = shipped("circuit"), np.arange(0.0, 0.05, 0.01)
+    u, y = signals(system, t)
+    online = online_of(Settings(estimator={"name": "ls_drem"}), system, "zoh", 0.0,
+                       np.append(u[0], y[0]))
+    rows = online.feed(t, u, y).regression.weighted()
+    *of_psi, of_Y = np.linalg.norm(rows.reshape(-1, rows.shape[-1]), axis=0)
+    assert 0.0 < min(of_psi) < max(of_psi) < 1.0
+    np.testing.assert_allclose(online.natural_sizes, of_Y / of_psi)
+
+
 def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
