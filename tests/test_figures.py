@@ -427,6 +427,7 @@ def test_errors_of_several_runs_are_on_a_logarithmic_axis_if_all_of_them_are(
     runs = [replace(result, settings=replace(result.settings, output=own)) for own in outputs]
     panels = figures._norm_panels([("", own, 0) for own in runs])
     assert {panel.log for panel in panels} == {"linear" not in errors}
+    assert [panel.legend for panel in panels] == [True, False]
     nobody = without_observer(result)
     assert figures._norm_panels([("", nobody, 0)]) == []
 

@@ -495,6 +495,21 @@ def slider_crank():
     return linearise(equations, constraints, motion, [across, along])
 
 
+def test_a_hanging_pendulum_swings_by_the_force_of_its_rod():
+    """m (x'', y'' + g) = λ (x, y) on a circle of the radius l: m δx'' = −(m g/l) δx."""
+    t = sp.Symbol("t")
+    x, y = (sp.Function(name)(t) for name in "xy")
+    m, g, length = sp.Integer(2), sp.Integer(10), sp.Integer(4)
+    model = linearise(
+        [m * x.diff(t, 2), m * y.diff(t, 2) + m * g], [(x**2 + y**2 - length**2) / 2],
+        {x: sp.Integer(0), y: -length}, [-m * g / length],
+    )
+    assert model == {
+        "positions": ["x", "y"], "M": [["2", "0"], ["0", "2"]], "D": [["0", "0"], ["0", "0"]],
+        "K": [["5", "0"], ["0", "5"]], "G": [["0", "-4"]],
+    }
+
+
 def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     """Index 3, against the equation of the crank's angle alone, which has no constraints."""
     model = {
