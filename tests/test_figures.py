@@ -409,6 +409,18 @@ def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
 
 
+@pytest.mark.parametrize(("truth", "guesses", "size", "limits"), [
+    ([1.0, 3.0], [2.0, np.nan], 0.0, (1.0, 3.0)), ([1.0, 3.0], [0.0, 4.0], 0.0, (0.0, 4.0)),
+    ([1.0, 3.0, np.nan], [-99.0, 99.0, np.inf], 0.0, (-3.0, 7.0)),
+    ([1.0, 3.0], [-99.0, 99.0], 5.0, (-9.0, 13.0)), ([-2.0], [-99.0, 99.0], 0.0, (-6.0, 2.0)),
+    ([0.0], [-99.0, 99.0], 0.0, (-2.0, 2.0)), ([np.nan], [1.0], 1.0, None),
+])
+def test_a_wild_estimate_is_cut_at_twice_the_range_of_the_truth(
+    truth: list[float], guesses: list[float], size: float, limits: tuple[float, float] | None
+) -> None:
+    assert figures._estimate_limits(np.array(truth), np.array([guesses]), size) == limits
+
+
 def test_a_residual_is_what_was_measured_less_what_is_fitted() -> None:
     result = make_result(samples=11)
     fit = Fit(np.ones(1), 1.0, 1.0, outputs=result.signals.outputs - 0.25)
