@@ -246,14 +246,16 @@ def test_a_plant_from_functions_and_from_a_mapping(tmp_path):
         "name": "rc", "states": ["x1", "x2"], "outputs": ["y1"], "E": np.diag([1, 0]),
         "A": ((-1, 1), (1, 2)), "C": [[1, 0.5]], "initial_state": np.array([1, -0.5]),
     }
-    other = run(
-        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in mapping.items()},
-        estimator="ls_drem", time={"samples": 51},
-    )
+    mapping = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in mapping.items()}
+    other = run(mapping, estimator="ls_drem", time={"samples": 51})
     np.testing.assert_allclose(one["x2"], other["x2"], atol=1e-13)
     np.testing.assert_allclose(one["x2"], -0.5 * one["x1"], atol=1e-12)
-    text = (one.save(tmp_path, figures=False) / "config.yaml").read_text()
-    assert text.startswith("# The plant, the estimator or the data was a Python object")
+    arrays = run(mapping, data={"t": one.t, "y1": one["y1"]}, time={"samples": 11})
+    for result, head in ((one, "The plant, the estimator or the data was a Python object"),
+                         (arrays, "The plant, the estimator or the data was a Python object"),
+                         (other, "Repeats the run: gpebo run --config-dir")):
+        text = (result.save(tmp_path / head[:3], figures=False) / "config.yaml").read_text()
+        assert text.startswith(f"# {head}")
     assert load_plant(system) is system
 
 
