@@ -292,6 +292,8 @@ def test_currents_of_the_drawing_obey_the_plant_s_equations() -> None:
     def entries(row: int) -> list[int]:
         return [entry if isinstance(entry, int) else 0 for entry in A[row]]
 
+    told = [gallery._branch_text(branch) for branch in circuit.BRANCHES[:2]]
+    assert told == ["V from ground to e1 with current iv", "C1 from e1 to ground"]
     assert entries(2) == voltage("L")  # (L il)' = its voltage
     assert entries(3) == voltage("R1")  # voltage + R1 ir1 = 0
     assert A[3][states.index("ir1")] == "R1"

@@ -294,9 +294,9 @@ class Observation:
     def about(
         self, columns: IntArray, make: Callable[[LinearRegression, IntArray], T]
     ) -> tuple[T, IntArray]:
-        """What is made of the regression about some parameters, the others being zero, and which.
+        """What is made of the regression about some of its parameters, and which these are, (k,).
 
-        They are all of them where settings have as many numbers as there are parameters.
+        The others are zero. They are all where settings have as many numbers as parameters.
         """
         whole = self.regression
         if 0 < len(columns) < whole.p and self.of_constants is not None:
