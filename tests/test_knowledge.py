@@ -24,6 +24,7 @@ from gpebo_cli.experiment.sensors import _fall, candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results import style
 from gpebo_cli.results.figures import describe
+from gpebo_cli.results.report import noise_table
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 
@@ -260,6 +261,8 @@ def test_statistics_over_seeds_are_those_of_the_parameters_that_are_seen():
     assert (mine.deviation[:, seen] > 0.0).all()
     for name in ("bias", "deviation", "rms"):
         assert np.isnan(getattr(mine, name)[:, ~np.array(seen)]).all()
+    told = {row.split()[1]: row.split()[2:] for row in noise_table(mine)}
+    assert {name for name in mine.names if told[name] == ["unknown"] * 3} == UNSEEN - {"c"}
 
 
 def test_what_is_not_determined_is_dashed_in_the_figures():
