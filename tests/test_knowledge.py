@@ -181,6 +181,19 @@ def test_what_is_left_of_a_state_has_no_unit_and_no_sign(kernel, growth):
     )
 
 
+def test_rounding_of_Y_is_larger_in_what_is_told_less():
+    """G = [1 c; c 1] and η = (1, 1): (η_1 − η_2)/√2 is off by |Y|/√(1 − c) and its own terms."""
+    shares, across = np.array([0.0, 0.5, 0.99]), np.array([[1.0, -1.0]]) / np.sqrt(2.0)
+    found = [
+        knowledge(G[None], np.ones(2), np.ones(1)).doubt(G @ np.ones(2), across)[0][0]
+        for G in (np.array([[1.0, c], [c, 1.0]]) for c in shares)
+    ]
+    expected = np.sqrt(2.0 * (1.0 + shares) / (1.0 - shares)) + np.sqrt(2.0)
+    np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-9)
+    alone = knowledge(np.eye(2)[None], np.ones(2), np.ones(1))
+    assert alone.doubt(np.array([1.0, 0.0]), np.array([[0.0, 1.0]]))[0] == 0.0  # it meets no Y
+
+
 CONF = Path(__file__).parents[1] / "conf"
 
 HALF_SEEN = """
