@@ -37,8 +37,12 @@ from gpebo_cli import (
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
+from gpebo_cli.experiment import limits
 from gpebo_cli.experiment.limits import paced
+from gpebo_cli.experiment.noise import noise_levels
 from gpebo_cli.findings import replaced
+from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.settings import Settings
 
 
 @pytest.fixture(scope="module")
@@ -227,6 +231,8 @@ def test_without_an_observer_there_are_signals_only(tmp_path):
     assert (result.parameters, result.excitation, result.estimates_t.shape) == ({}, None, (0,))
     with pytest.raises(ConfigError, match="made with observer=none"):
         result.to_pandas("estimates")
+    with pytest.raises(ConfigError, match=r"there is no table 'estimate'.*did you mean estimates"):
+        result.to_pandas("estimate")
     assert len(result.plot().axes) >= 1
     assert [p.name for p in result.save(tmp_path / "o", figures=False).glob("*.csv")] == [
         "signals.csv"
@@ -242,14 +248,16 @@ def test_a_plant_from_functions_and_from_a_mapping(tmp_path):
         "name": "rc", "states": ["x1", "x2"], "outputs": ["y1"], "E": np.diag([1, 0]),
         "A": ((-1, 1), (1, 2)), "C": [[1, 0.5]], "initial_state": np.array([1, -0.5]),
     }
-    other = run(
-        {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in mapping.items()},
-        estimator="ls_drem", time={"samples": 51},
-    )
+    mapping = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in mapping.items()}
+    other = run(mapping, estimator="ls_drem", time={"samples": 51})
     np.testing.assert_allclose(one["x2"], other["x2"], atol=1e-13)
     np.testing.assert_allclose(one["x2"], -0.5 * one["x1"], atol=1e-12)
-    text = (one.save(tmp_path, figures=False) / "config.yaml").read_text()
-    assert text.startswith("# The plant, the estimator or the data was a Python object")
+    arrays = run(mapping, data={"t": one.t, "y1": one["y1"]}, time={"samples": 11})
+    for result, head in ((one, "The plant, the estimator or the data was a Python object"),
+                         (arrays, "The plant, the estimator or the data was a Python object"),
+                         (other, "Repeats the run: gpebo run --config-dir")):
+        text = (result.save(tmp_path / head[:3], figures=False) / "config.yaml").read_text()
+        assert text.startswith(f"# {head}")
     assert load_plant(system) is system
 
 
@@ -478,6 +486,26 @@ def test_stages_take_a_part_of_the_time_that_all_takes():
     timings = run("window", time={"horizon": 1.0}).details.timings
     assert 0.0 < sum(timings.values()) < time.perf_counter() - since
     assert min(timings.values()) >= 0.0
+
+
+def test_memory_is_refused_by_how_many_equations_are_differential():
+    """Of 40 states one has a derivative at the start, or from t = 1 on all have."""
+    E = np.diag(["1", *["step(t - 1)"] * 39]).tolist()
+    plant = plant_from_mapping({
+        "name": "many", "states": [f"x{k}" for k in range(40)], "outputs": ["y"],
+        "E": [[entry or 0 for entry in row] for row in E], "A": (-np.eye(40)).tolist(),
+        "C": np.ones((1, 40)).tolist(), "initial_state": [0] * 40,
+    })
+    for start, refusal in ((0.0, None), (np.nan, None), (2.0, "5.25 GB"), (0.9, None)):
+        time = TimeSettings(start=start, samples=50_000)
+        settings = Settings({}, time=time)
+        levels = noise_levels(settings.noise, plant)
+        limits.check(settings, plant, levels, 0)  # nothing is estimated
+        if refusal is None:
+            limits.check(settings, plant, levels, 1)
+        else:
+            with refused(f"time.samples = 50000 would take some {refusal} of memory"):
+                limits.check(settings, plant, levels, 1)
 
 
 def test_a_loop_tells_which_share_of_it_is_done():

@@ -118,6 +118,13 @@ def test_the_pencil_is_judged_in_no_units():
             assert other[name].evidence[key] == pytest.approx(value, rel=0.3)
 
 
+def test_without_an_observer_there_are_the_assumptions_of_the_simulation():
+    names = found(lti(), name="none")
+    assert list(names) == ["Solvability", "Consistent start", "Regularity", "Rank condition D2"]
+    kept = found(lti(C=[], outputs=[]), name="none")
+    assert list(kept) == ["Solvability", "Consistent start"]
+
+
 def test_an_unsolvable_plant_stops_at_the_first_assumption():
     names = found(lti(E=[[1, 0], [0, 0]], A=[[-1, 1], [0, 0]]))
     assert list(names) == ["Solvability"]

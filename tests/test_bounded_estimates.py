@@ -173,6 +173,7 @@ def test_estimates_respect_bounds_at_all_times_whatever_the_estimator(tmp_path):
                      time={"horizon": HORIZON, "samples": 41})
         assert result.estimates["h1"].min() >= LOW - 1e-9
         assert result.estimates["leak"].min() >= -1e-9
+        assert result.details.estimation.doubts == ({}, ())  # least squares know no bounds
     assert "held by bounds: leak = 0, h1 = -0.84 at t = " in result.verdict
     result.save(tmp_path / "run")
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())

@@ -29,6 +29,7 @@ from processes import (
 
 from gpebo_cli import run
 from gpebo_cli.cli.job import remove_if_empty
+from gpebo_cli.cli.listing import KINDS
 
 FAST = ["figures=none", "time.samples=51"]
 
@@ -107,10 +108,12 @@ def test_list_names_and_titles(tmp_path, mine):
     words = ("plants", "circuit", "drem", "gpebo", "paper_circuit", "arXiv:2407", "published/sir")
     for word in words:
         assert word in said
+    assert [line for line in said.splitlines() if line[:1].strip()] == list(KINDS)
     plants = gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path)
     assert "mine" in plants.stdout
     assert "a decaying state [nowhere]" in plants.stdout
     assert "drem" not in plants.stdout
+    assert not any(line.startswith(("plants", " ")) for line in plants.stdout.splitlines())
 
 
 def test_every_file_of_a_group_has_a_title():

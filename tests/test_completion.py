@@ -16,7 +16,7 @@ from processes import assert_refused
 
 from gpebo_cli.cli.app import COMMANDS
 from gpebo_cli.cli.completion import SHELLS, answer, candidates
-from gpebo_cli.configs.locations import GROUPS
+from gpebo_cli.configs.locations import GROUPS, outline
 from gpebo_cli.evidence.metrics import NAMES
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.results.figures import FIGURES
@@ -68,7 +68,8 @@ def test_a_line_begins_with_the_command_whatever_its_name(command, capsys):
 
 def test_values_of_ones_own_folder(here):
     assert "plant=mine" not in names("run", "plant=")
-    for words in (["--config-dir", "."], ["--config-dir=."], ["-cd", str(here)]):
+    for words in (["--config-dir", "."], ["--config-dir=."], ["-cd", str(here)],
+                  ["-m", "time.samples=11", "-cd", "."]):
         assert names("run", *words, "plant=mi") == ["plant=mine"]
 
 
@@ -84,6 +85,16 @@ def test_keys_are_those_of_the_chosen_file():
     assert "estimator.lambda=" in names("run", "estimator=drem", "estimator.")
     assert "observer.output=" in names("run", "observer=canonical", "observer.")
     assert "solver.tol=" in names("run", "solver.")
+
+
+def test_an_outline_has_keys_and_those_of_a_section_but_none_below(tmp_path):
+    """Of what is read for completion: sections indented by one blank or by two, and comments."""
+    file = tmp_path / "a.yaml"
+    file.write_text("a: 1\n# b: 2\ns:\n c: 3\n # d: 4\n c: 5\n   e: 6\nu:\n  f: 7\n   g: 8\n  h\n")
+    assert outline(str(file)) == {"a": " 1", "s": "", "u": ""}
+    assert outline(str(file), "s") == {"c": " 3"}
+    assert outline(str(file), "u") == {"f": " 7"}
+    assert outline(str(tmp_path)) == {}
 
 
 def test_figures_list_topics_recipes_and_columns():

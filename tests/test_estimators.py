@@ -923,6 +923,9 @@ def test_a_parameter_has_the_size_with_which_it_alone_would_explain_the_data():
     )[0]
     natural = accuracy.natural_sizes(NOISY, 3)
     np.testing.assert_allclose(natural, np.sqrt(of_Y / squares), rtol=1e-9)
+    faint = Trajectory(NOISY.mesh, NOISY.psi.values * [1e-3, 0.0, 1e3])
+    other = accuracy.natural_sizes(replace(NOISY, psi=faint), 3)
+    np.testing.assert_allclose(other, natural * [1e3, 0.0, 1e-3], rtol=1e-9)
     assert not accuracy.natural_sizes(NOISY, 5).any()
     truth = np.array([[0.0, 1e-3, -2.0], [0.0, -2e-3, 1.0]])
     sizes, _ = accuracy.sizes_of(truth, natural, truth)

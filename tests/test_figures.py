@@ -21,8 +21,8 @@ from matplotlib.text import Text
 from PIL import Image
 
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.experiment.result import EstimationResult, RunResult
-from gpebo_cli.results import style, symbols
+from gpebo_cli.experiment.result import EstimationResult, Fit, RunResult
+from gpebo_cli.results import figures, style, symbols
 from gpebo_cli.results.figures import FIGURES, describe, draw
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import Provenance
@@ -265,6 +265,14 @@ def test_without_mixing_there_is_no_delta() -> None:
     assert "delta" not in dict(draw(make_result(samples=51, mixing=False)))
 
 
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_each_parameter_has_its_eigenvalue(count: int) -> None:
+    result = make_result(samples=51, parameters=("e0_e1", "e0_e2")[:count])
+    (panel, *_) = describe(result, ["gram"]).get("gram", [None])
+    assert (panel is None) == (count == 0)
+    assert panel is None or len(panel.curves) == count + 1
+
+
 EIGENVALUES = [rf"$\lambda_{{{k}}}$" for k in (1, 2, 3)]
 
 
@@ -410,6 +418,61 @@ def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     noisy = replace(result, simulation=replace(result.simulation, measured_outputs=measured))
     _, outputs = describe(noisy, ["signals"])["signals"]
     assert [curve.label for curve in outputs.curves] == ["y measured", "y"]
+
+
+@pytest.mark.parametrize(("truth", "guesses", "size", "limits"), [
+    ([1.0, 3.0], [2.0, np.nan], 0.0, (1.0, 3.0)), ([1.0, 3.0], [0.0, 4.0], 0.0, (0.0, 4.0)),
+    ([1.0, 3.0, np.nan], [-99.0, 99.0, np.inf], 0.0, (-3.0, 7.0)),
+    ([1.0, 3.0], [-99.0, 99.0], 5.0, (-9.0, 13.0)), ([-2.0], [-99.0, 99.0], 0.0, (-6.0, 2.0)),
+    ([0.0], [-99.0, 99.0], 0.0, (-2.0, 2.0)), ([np.nan], [1.0], 1.0, None),
+])
+def test_a_wild_estimate_is_cut_at_twice_the_range_of_the_truth(
+    truth: list[float], guesses: list[float], size: float, limits: tuple[float, float] | None
+) -> None:
+    assert figures._estimate_limits(np.array(truth), np.array([guesses]), size) == limits
+
+
+def test_a_residual_is_what_was_measured_less_what_is_fitted() -> None:
+    result = make_result(samples=11)
+    fit = Fit(np.ones(1), 1.0, 1.0, outputs=result.signals.outputs - 0.25)
+    outputs, residual = describe(replace(result, fit=fit), ["fit"])["fit"]
+    assert [curve.label for curve in outputs.curves] == ["y measured", "y fitted"]
+    np.testing.assert_allclose(residual.curves[0].y, 0.25)
+    assert (residual.name, residual.unit) == ("residual of y", "A")
+
+
+@pytest.mark.parametrize("errors", [("log", "log"), ("log", "linear"), ("linear", "log")])
+def test_errors_of_several_runs_are_on_a_logarithmic_axis_if_all_of_them_are(
+    errors: tuple[str, str]
+) -> None:
+    result = make_result(samples=11)
+    outputs = [OutputSettings(error=error) for error in errors]
+    runs = [replace(result, settings=replace(result.settings, output=own)) for own in outputs]
+    panels = figures._norm_panels([("", own, 0) for own in runs])
+    assert {panel.log for panel in panels} == {"linear" not in errors}
+    assert [panel.legend for panel in panels] == [True, False]
+    nobody = without_observer(result)
+    assert figures._norm_panels([("", nobody, 0)]) == []
+
+
+@pytest.mark.parametrize(("settled", "names"), [
+    (None, ["final error", "time to 1 %"]), ({}, ["final error"]),
+    ({"il": np.array([np.nan, 3.0, 2.0]), "iv": np.array([np.nan, 1.0, 4.0])},
+     ["final error", "time to ±2σ"]),
+])
+def test_under_noise_the_time_to_settle_stands_for_that_to_one_percent(
+    settled: Any, names: list[str]
+) -> None:
+    """Of the last quantity, over the gain; where nobody knows it there is no panel."""
+    result = make_result((1e10, 1e8, 1e6), samples=11)
+    assert result.metrics is not None
+    result = replace(result, metrics=replace(result.metrics, seconds_to_settled=settled))
+    panels = describe(result, ["gains"])["gains"]
+    assert [panel.name for panel in panels] == names
+    if settled:
+        (curve,) = panels[1].curves
+        np.testing.assert_array_equal(curve.x, [1e6, 1e8, 1e10])
+        np.testing.assert_array_equal(curve.y, [4.0, 3.0, np.nan])
 
 
 @pytest.mark.parametrize(("gammas", "bands"), [((1e10,), 1), ((1e10, 1e8), 0)])

@@ -133,6 +133,28 @@ def test_what_does_not_fit_is_named(changes, message):
         circuit(**changes).coefficients.taylor(np.array([1.0, 2.0, 3.0]), 0)
 
 
+def test_entries_that_come_later_and_outputs_that_are_not_known_are_named():
+    """Where entries are stored is found at a few times; a mistake within a function is its own."""
+    def later(t):
+        return [sparse.csr_array([[-1.0, float(time == 5.0)], [0.0, -1.0]]) for time in t]
+
+    def wrong(t):
+        raise TypeError("a mistake of one's own")
+
+    two = {"E": np.eye(2), "C": [[1.0, 0.0]], "initial_state": [1.0, 1.0]}
+    source = system_from_functions("two", A=later, **two).coefficients
+    np.testing.assert_array_equal(source.taylor(np.ones(1), 0).A[0, 0], -np.eye(2))
+    with pytest.raises(ConfigError, match="plant two: A has entries where it had none at other t"):
+        source.taylor(np.array([1.0, 5.0]), 0)
+    fed = system_from_functions("two", A=lambda t, u, y: np.zeros((len(t), 2, 2)), **two)
+    with pytest.raises(ConfigError, match="plant two: A depends on the outputs, which are not kn"):
+        fed.coefficients.taylor(np.ones(1), 0)
+    with pytest.raises(TypeError, match="a mistake of one's own"):
+        system_from_functions("two", A=wrong, **two).coefficients.taylor(np.ones(1), 0)
+    rows = [lambda t: np.ones((len(t), 3, 2)), lambda t: np.zeros((len(t), 3, 2))]
+    assert system_from_functions("two", A=-np.eye(2), **two | {"C": rows}).r == 3
+
+
 def test_a_large_plant():
     """A chain of 40 oscillators whose ends are tied together: index 3, constant coefficients."""
     masses = 40

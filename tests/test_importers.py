@@ -263,6 +263,8 @@ def damped(t, since):
      - 2 * -np.expm1(-(t - 2).clip(0) / 0.3)),
     ("PWL(0.5 1 1 3 1 -1 2 4)", lambda t: np.interp(
         t, [0.5, 1, np.nextafter(1, 2), 2], [1, 3, -1, 4])),
+    ("PULSE(0 1 0 0.5 0.5 0.5 1.5 2)", lambda t: np.interp(  # one right after the other
+        t, [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0])),
     ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
@@ -438,8 +440,10 @@ def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
 
 
 def test_what_continues_and_what_is_a_comment():
-    netlist = read_netlist("title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n")
+    text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n"
+    netlist = read_netlist(text)
     assert [(e.name, e.value) for e in netlist.elements.values()] == [("C1", 1.0), ("R1", 5.0)]
+    assert netlist.title == "a title"
 
 
 @pytest.mark.parametrize(("lines", "message"), [
@@ -573,6 +577,21 @@ def slider_crank():
     return linearise(equations, constraints, motion, [across, along])
 
 
+def test_a_hanging_pendulum_swings_by_the_force_of_its_rod():
+    """m (x'', y'' + g) = λ (x, y) on a circle of the radius l: m δx'' = −(m g/l) δx."""
+    t = sp.Symbol("t")
+    x, y = (sp.Function(name)(t) for name in "xy")
+    m, g, length = sp.Integer(2), sp.Integer(10), sp.Integer(4)
+    model = linearise(
+        [m * x.diff(t, 2), m * y.diff(t, 2) + m * g], [(x**2 + y**2 - length**2) / 2],
+        {x: sp.Integer(0), y: -length}, [-m * g / length],
+    )
+    assert model == {
+        "positions": ["x", "y"], "M": [["2", "0"], ["0", "2"]], "D": [["0", "0"], ["0", "0"]],
+        "K": [["5", "0"], ["0", "5"]], "G": [["0", "-4"]],
+    }
+
+
 def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     """Index 3, against the equation of the crank's angle alone, which has no constraints."""
     model = {
@@ -617,7 +636,9 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     ({"measure": "q1"}, "measure: expected a list"),
     ({"inputs": ["u"]}, "inputs: expected a mapping of names"),
     ({"K": 3}, "K: expected a list"), ({"K": [1, 2]}, "K[0]: expected a list"),
-    ({"M": [[0]] * 1001}, "M has 1001 rows"), ({"units": "m"}, "units: expected a mapping"),
+    ({"M": [[0]] * 1001}, "M has 1001 rows and G 1; 1 to 1000 are read"),
+    ({"M": []}, "M has 0 rows"), ({"G": [[1, -1]] * 1001}, "M has 2 rows and G 1001;"),
+    ({"units": "m"}, "units: expected a mapping"),
     ({"B": None}, "B has 0 rows; expected 2"), ({"F": []}, "F has 0 rows; expected 2"),
     *(({"positions": ["q1", name], "r": [1]}, f"{name} is the name of two things; velocities are")
       for name in ("q1", "v_q1", "lambda1", "r1", "force", "load")),

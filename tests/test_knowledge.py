@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from gpebo_cli.experiment.sensors import _fall, candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.results import style
 from gpebo_cli.results.figures import describe
+from gpebo_cli.results.report import noise_table
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 
@@ -179,6 +181,19 @@ def test_what_is_left_of_a_state_has_no_unit_and_no_sign(kernel, growth):
     )
 
 
+def test_rounding_of_Y_is_larger_in_what_is_told_less():
+    """G = [1 c; c 1] and η = (1, 1): (η_1 − η_2)/√2 is off by |Y|/√(1 − c) and its own terms."""
+    shares, across = np.array([0.0, 0.5, 0.99]), np.array([[1.0, -1.0]]) / np.sqrt(2.0)
+    found = [
+        knowledge(G[None], np.ones(2), np.ones(1)).doubt(G @ np.ones(2), across)[0][0]
+        for G in (np.array([[1.0, c], [c, 1.0]]) for c in shares)
+    ]
+    expected = np.sqrt(2.0 * (1.0 + shares) / (1.0 - shares)) + np.sqrt(2.0)
+    np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-9)
+    alone = knowledge(np.eye(2)[None], np.ones(2), np.ones(1))
+    assert alone.doubt(np.array([1.0, 0.0]), np.array([[0.0, 1.0]]))[0] == 0.0  # it meets no Y
+
+
 CONF = Path(__file__).parents[1] / "conf"
 
 HALF_SEEN = """
@@ -195,6 +210,12 @@ F: [[1, 0], [0, 0], [0, 1]]
 C: [[1, 0, 0]]
 initial_state: {a: 1, b: 0.5, c: 2}
 """
+WHOLE = yaml.safe_load(HALF_SEEN)
+ALONE = {  # what the output sees of it
+    **WHOLE, "states": ["a", "b"], "unknowns": {"k1": 2.0}, "E": [[1, 0], [0, 1]],
+    "A": [[-1, 1], [0, -0.5]], "B": [[1], [0]], "F": [[1], [0]], "C": [[1, 0]],
+    "initial_state": {"a": 1, "b": 0.5},
+}
 SEEN, UNSEEN = {"a", "b", "k1", "e0_a", "e0_b"}, {"c", "k2", "e0_c"}
 
 
@@ -222,6 +243,39 @@ def test_a_run_goes_on_without_what_is_not_determined(half_seen):
     rows = rows_of(half_seen / "out" / "cases.csv")
     times = {name: rows[0][f"seconds_to_1pct_{name}"] for name in SEEN | UNSEEN}
     assert {name for name, time in times.items() if time} == SEEN
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])
+def test_what_is_seen_is_estimated_as_if_there_were_nothing_else(observer):
+    """The same deviations as of a, b and k1 alone; a gain for each parameter is that of all."""
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.1}
+    given = {"observer": observer, "noise": noise, "time": {"horizon": 5.0, "samples": 51}}
+    gains = dict.fromkeys(("k1", "k2", "e0_a", "e0_b", "e0_c"), 100.0)
+    for of, one, other in (
+        (("hat", "std"), run(WHOLE, estimator="ls_drem", **given),
+         run(ALONE, estimator="ls_drem", **given)),
+        (("hat",), run(WHOLE, estimator="gradient", gamma=gains, **given),
+         run(WHOLE, estimator="gradient", gamma=100.0, **given)),
+    ):
+        mine, theirs = (result.to_pandas("estimates") for result in (one, other))
+        names = [f"{name}_{kind}" for name in sorted(SEEN) for kind in of]
+        np.testing.assert_allclose(mine[names], theirs[names], rtol=1e-6, atol=1e-9)
+
+
+def test_statistics_over_seeds_are_those_of_the_parameters_that_are_seen():
+    """As of a, b and k1 alone; of what is not determined there are none."""
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.1, "seeds": 3}
+    given = {"estimator": "ls_drem", "noise": noise, "time": {"horizon": 5.0, "samples": 51}}
+    mine, theirs = (run(plant, **given).details.noise for plant in (WHOLE, ALONE))
+    seen = [name in SEEN for name in mine.names]
+    assert tuple(compress(mine.names, seen)) == theirs.names
+    for name in ("truth", "bias", "deviation", "rms"):
+        np.testing.assert_allclose(getattr(mine, name)[..., seen], getattr(theirs, name), rtol=1e-5)
+    assert (mine.deviation[:, seen] > 0.0).all()
+    for name in ("bias", "deviation", "rms"):
+        assert np.isnan(getattr(mine, name)[:, ~np.array(seen)]).all()
+    told = {row.split()[1]: row.split()[2:] for row in noise_table(mine)}
+    assert {name for name in mine.names if told[name] == ["unknown"] * 3} == UNSEEN - {"c"}
 
 
 def test_what_is_not_determined_is_dashed_in_the_figures():
@@ -309,6 +363,10 @@ def test_a_state_that_is_known_without_outputs_has_no_part_in_how_deviations_fal
     falls = [(sensor.fall, sensor.fall_together) for sensor in found]
     np.testing.assert_allclose(falls, np.sqrt([[2.0, 2.0], [1.0, 2.0]]), rtol=1e-9)
     assert [sensor.gained for sensor in found] == [(), ()]
+    twice = plant | {"states": ["a"], "inputs": {}, "outputs": ["y", "z"], "E": [[1]], "A": [[-1]],
+                     "B": [], "C": [[1], [1]], "initial_state": [1]}
+    (third,) = candidates(Settings({}, TimeSettings(horizon=5.0)), plant_from_mapping(twice))
+    assert third.fall == pytest.approx(np.sqrt(1.5))
     for other in (Settings({}, observer={"name": "none"}), Settings({}, data=DataSettings("csv"))):
         with refused("sensors=all needs a simulation of a plant"):
             candidates(other, plant_from_mapping(plant))

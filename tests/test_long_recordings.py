@@ -12,7 +12,7 @@ from gpebo_cli import estimators, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
-from gpebo_cli.evidence.groups import grouped
+from gpebo_cli.evidence.groups import each_alone, grouped
 from gpebo_cli.experiment.fit import _follows, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
@@ -274,6 +274,7 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     edges = np.sort(np.append(samples, jump))
     rows = Rows(samples)
     groups = grouped(rows, 100.0, np.array([50.0]), np.zeros(1), 20, 16)
+    assert [found.alone for found in (groups, each_alone(rows, np.zeros(1)))] == [False, True]
     mesh = uncertainty._mesh(edges, groups, edges[:1])
     fresh = np.diff(uncertainty._group_of(mesh, groups.starts), prepend=-1) > 0
     expected = np.union1d(groups.starts, [jump, 100.0])
@@ -421,6 +422,17 @@ def test_noise_in_the_matrices_is_named_and_may_be_taken_out():
     wrong = run(shipped("duffing", A=[[0, 1], [0, -0.2]]), **given).verdict  # damping is 0.3
     assert "is not white" in wrong
     assert "in the matrices" not in wrong
+
+
+def test_at_samples_estimates_are_as_far_from_least_squares_as_in_continuous_time():
+    """Of parameters and of states at the end, which a drift has moved since the start."""
+    given = {"estimator": "gradient", "gamma": 1e-3, "time": {"samples": 201}}
+    found = [
+        run("battery", observer=observer, **given).details.estimation.doubts[0]
+        for observer in ({}, {"sample_time": 0.05})
+    ]
+    assert found[1] == pytest.approx(found[0], rel=0.05, abs=1e-3)
+    assert max(found[0].values()) > 0.5
 
 
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])

@@ -73,6 +73,12 @@ def test_a_signal_without_noise_of_its_own_keeps_its_bits():
     noisy = run_experiment(replace(settings, noise=replace(noise, inputs=0.1)), system).simulation
     assert np.std(noisy.measured_inputs - noisy.inputs) == pytest.approx(0.1, rel=0.3)
     assert np.std(simulation.measured_outputs - simulation.outputs) == pytest.approx(0.1, rel=0.3)
+    system = shipped("canonical")
+    settings = replace(settings, noise=replace(noise, outputs={system.outputs[0]: 0.1}))
+    simulation = run_experiment(settings, system).simulation
+    noisy, silent = (simulation.measured_outputs - simulation.outputs).T
+    assert noisy.all()
+    assert not silent.any()
 
 
 # Instants -----------------------------------------------------------------------------------

@@ -292,6 +292,8 @@ def test_currents_of_the_drawing_obey_the_plant_s_equations() -> None:
     def entries(row: int) -> list[int]:
         return [entry if isinstance(entry, int) else 0 for entry in A[row]]
 
+    told = [gallery._branch_text(branch) for branch in circuit.BRANCHES[:2]]
+    assert told == ["V from ground to e1 with current iv", "C1 from e1 to ground"]
     assert entries(2) == voltage("L")  # (L il)' = its voltage
     assert entries(3) == voltage("R1")  # voltage + R1 ir1 = 0
     assert A[3][states.index("ir1")] == "R1"
@@ -364,6 +366,10 @@ def test_curves_that_come_go_or_end_are_differences(tmp_path: Path) -> None:
     ended = Curve(t, np.where(t > 0.5, np.nan, t), "a", line(0))
     [text] = compare([Panel("y", (ended,))], [Panel("y", (curves[0],))], tmp_path)
     assert "it is nan" in text
+    other = replace(curves[0], x=t**2, y=t**2)
+    assert compare([Panel("y", (other,))], [Panel("y", (curves[0],))], tmp_path) == [
+        "t does not have the values of the reference among its own"
+    ]
 
 
 def test_a_changed_table_fails_the_check(tmp_path: Path) -> None:

@@ -952,6 +952,18 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
+    """The first sample of a file takes the place of the last one of the file before."""
+    t = np.array([0.0, 0.5, 1.0])
+    y = np.array([[1.0, 0.6, 0.4], [2.0, 1.2, 0.7], [3.0, 1.8, 1.1]])
+    files = [write_table(tmp_path / f"{k}.csv", {"t": t + k, "y": y[k]}) for k in range(3)]
+    plant = one_state(A=[[-1]])
+    found = run(plant, data={"file": files, "hold": "linear"}, time={"samples": 3})
+    np.testing.assert_allclose(found.t, np.arange(7) / 2.0)
+    (name,) = found.outputs
+    np.testing.assert_allclose(found.outputs[name], [*y[0, :2], *y[1, :2], *y[2]])
+
+
 def test_what_is_known_at_samples_of_several_files_is_put_one_after_the_other():
     """Elements and samples move by the same; where two files meet, the second one's count."""
     first, second = (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import shutil
 import subprocess
 from dataclasses import replace
@@ -21,9 +22,10 @@ from processes import assert_refused, refused
 from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.experiment.result import NoiseStatistics
+from gpebo_cli.experiment.result import Fit, NoiseStatistics
 from gpebo_cli.results import document, html
 from gpebo_cli.results.folder import write_run
+from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.report import case_table, estimate_table, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
@@ -64,10 +66,49 @@ def test_an_estimate_stands_since_it_is_within_a_hundredth_of_its_end():
     assert "  3 s  " in row
 
 
+def test_every_cell_of_the_table_of_estimates():
+    """Of the case that explains most: ±2σ where they are known, 1 % elsewhere, or not moved."""
+    made = make_result((1.0, 2.0), samples=11, parameters=("e0_e1", "e0_e2", "w_il"))
+    states, eta = np.ones((2, 11, 6)), np.ones((2, 11, 3))
+    states[1] = [0.5, np.nan, np.nan, 3.0, 4.0, 5.0]
+    eta[1] = [7.0, 8.0, 9.0]
+    eta[1, :4, 0] = [7.0, 6.0, 7.01, 6.8]  # since the fifth time, 8 s, within 1 % of the end
+    found = replace(
+        made.estimation, states=states, parameters=eta,
+        states_std=np.full((2, 11, 6), 0.125), parameters_std=np.full((2, 11, 3), np.nan),
+    )
+    made = replace(
+        made, estimation=found, fit=Fit(np.array([2.0, 1.0]), 1.0, 1.0), left_out=("il",),
+        estimable={"e1": 0.0, "e2": None, "il": None, "e0_e1": 2.5, "e0_e2": None},
+    )
+    known = [
+        ["e0_e1", "7", "V", "8 s", "from 2.5 s"], ["e0_e2", "8", "V", "0 s", "no"],
+        ["w_il", "9"], ["e1", "0.5", "0.12", "V", "from 0 s"], ["e2", "not determined", "V", "no"],
+        ["il", "left out", "A", "no"], ["ir1", "3", "0.12", "A"], ["ir2", "4", "0.12", "A"],
+        ["iv", "5", "0.12", "A"],
+    ]
+
+    def cells(result):
+        return [re.split(" {2,}", line.strip()) for line in estimate_table(result)]
+
+    head, *rows = cells(made)
+    assert head == ["estimate", "± std", "unit", "within 1 % of the end since", "estimable"]
+    assert rows == known
+    settled = {"e0_e1": np.array([1.0, 6.0]), "e0_e2": np.full(2, np.nan)}
+    made = replace(made, metrics=replace(made.metrics, seconds_to_settled=settled))
+    head, *rows = cells(made)
+    assert head[3] == "within ±2σ of the end since"
+    known[:2] = ["e0_e1", "7", "V", "6 s", "from 2.5 s"], ["e0_e2", "8", "V", "no"]
+    assert rows == known
+    made = replace(made, estimation=replace(found, still=np.array([False, True])))
+    assert cells(made)[1] == ["e0_e1", "not moved from 7", "V", "from 2.5 s"]
+
+
 @pytest.mark.parametrize(("count", "shown"), [(12, 12), (13, 12), (30, 12)])
 def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     head, *rows = case_table(make_result(gammas=tuple(range(1, count + 1)), samples=5))
     told = [row.split()[0] for row in rows if "…" not in row]
+    assert re.split(" {2,}", head.strip())[1:] == list(METRICS.values())[:4]
     assert head.split()[0] == "gamma"
     assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
     assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import yaml
 from examples import ROOT, gpebo
@@ -65,11 +67,27 @@ def test_a_page_and_its_pictures_are_written(tmp_path, monkeypatch, capsys):
 def test_a_number_that_is_off_is_an_exit_code(tmp_path, monkeypatch, capsys):
     found = reproduce.Finding("r", "t", "s", "last.x", 1.0, 1.1, 0.05, "page 3")
     monkeypatch.setattr(reproduce, "reproduced", lambda name, options, pictures: [found])
+    near = [replace(found, ours=ours).holds for ours in (None, 0.94, 0.96, 1.04, 1.06)]
+    assert near == [True, False, True, True, False]
     assert reproduce.main(["gelda"]) == 1
     out = capsys.readouterr().out
     assert "OFF by 0.1" in out
     assert out.endswith("1 recipe, 1 number, 1 off\n")
     assert_refused(gpebo("reproduce", "geldaa", cwd=tmp_path), "did you mean gelda?")
+
+
+def test_quantities_are_those_of_signals_estimates_and_cases():
+    from gpebo_cli import run
+
+    result = run("circuit", estimator="drem", gamma=[1e8, 1e10],
+                 time={"horizon": 1, "samples": 11}).details
+    x, found = result.signals.states[:, 1], result.estimation
+    for name, values in (
+        ("first.e2", [x[0]]), ("last.e2", [x[-1]]), ("max.e2", [x.max()]), ("min.e2", [x.min()]),
+        ("final.e2", found.states[:, -1, 1]), ("final.e0_e2", found.parameters[:, -1, 1]),
+        ("case.final_error_states", result.metrics.final_error_states),
+    ):
+        assert reproduce.quantity(result, name, "recipe") == list(values), name
 
 
 def test_a_quantity_that_is_none_names_those_there_are():

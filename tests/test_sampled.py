@@ -303,6 +303,17 @@ def test_assumption_1_is_judged_by_its_weakest_sample():
     assert one.evidence["smallest_singular_value_at_least"] == pytest.approx(smallest, rel=1e-4)
 
 
+def test_a_parameter_alone_would_explain_the_data_at_samples_with_its_size():
+    system, t = shipped("circuit"), np.arange(0.0, 0.05, 0.01)
+    u, y = signals(system, t)
+    online = online_of(Settings(estimator={"name": "ls_drem"}), system, "zoh", 0.0,
+                       np.append(u[0], y[0]))
+    rows = online.feed(t, u, y).regression.weighted()
+    *of_psi, of_Y = np.linalg.norm(rows.reshape(-1, rows.shape[-1]), axis=0)
+    assert 0.0 < min(of_psi) < max(of_psi) < 1.0
+    np.testing.assert_allclose(online.natural_sizes, of_Y / of_psi)
+
+
 def test_what_is_remembered_does_not_grow():
     system = shipped("circuit")
     t = np.arange(0.0, 4.0, 0.01)
@@ -627,11 +638,28 @@ def test_the_power_law_at_samples_needs_what_its_start_is_off():
         })
 
 
+def test_the_level_that_is_asked_for_is_reached_at_a_sample():
+    found = gpebo_cli.run(
+        "circuit", observer={"sample_time": 0.1}, excitation={"rho": 1e-3}, estimator="ls_drem",
+        time={"samples": 201},
+    ).details.excitation
+    reached = found.t[found.gram_eigenvalues[:, 0] >= 1e-3]
+    assert found.t_c == reached[0] > found.t[1]
+
+
 def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
-    assert all(
-        isinstance(estimators.build({"name": name}), estimators.Recursive)
-        for name in estimators.names()
-    )
+    """Before the first sample none of them has what it requires."""
+    for name in estimators.names():
+        built = estimators.build({"name": name})
+        assert isinstance(built, estimators.Recursive)
+        requirement = built.recursive(["a", "b", "c"]).requirement
+        assert not requirement.holds, name
+        (reached,) = {"left_of_the_initial_error", "gamma_times_integral",
+                      "alpha_lambda_min_over_f0"} & set(requirement.evidence)
+        assert requirement.evidence[reached] == float(reached.startswith("left"))
+    bounded = estimators.build({"name": "least_squares", "f0": 1.0, "beta": 1.0, "bound": 9.0})
+    with pytest.raises(ConfigError, match=r"^estimator\.bound works in continuous time only; at "):
+        bounded.recursive(["a"])
     with pytest.raises(ConfigError, match=r"these can: annihilator, drem, exciting, .*, lion"):
         estimators.able(object(), estimators.Recursive, "samples")
 

@@ -57,7 +57,7 @@ class Power(ResumableEstimator):
 
     def axes(self) -> dict[str, Sequence[float]]:
         """The gain γ (ConfigError: a power or γ₂ is out of its range)."""
-        if not (0.0 < self.alpha < 1.0 < self.beta < np.inf and 0.0 <= self.gamma2 < np.inf):
+        if not (0.0 < self.alpha < 1.0 < self.beta and self.gamma2 >= 0.0):
             raise ConfigError(
                 "estimator: it takes 0 < alpha < 1 < beta and gamma2 of 0 or more, got "
                 f"alpha={self.alpha:g}, beta={self.beta:g}, gamma2={self.gamma2:g}"

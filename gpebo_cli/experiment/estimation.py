@@ -41,10 +41,8 @@ from gpebo_cli.experiment.uncertainty import (
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.findings import replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
 from gpebo_cli.observers._base import Differentiable, Filtering
-from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.settings import Settings
 from gpebo_cli.simulation.signals import Signals
 
@@ -123,7 +121,7 @@ def continuous(
         with stage("seeds") as pace:
             noise = over_seeds(
                 observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
-                pace,
+                pace, known.independent, np.isfinite(estimation.parameters[0, -1]),
             )
     unknown = [
         name for name, is_known in told.items() if not (is_known or name in observation.unseen)
@@ -183,11 +181,10 @@ def _with_deviations(
         return estimation.with_deviations(std), ""
     if not settings.uncertainty or observation.estimator is not None:
         return estimation, ""
-    some, columns = _about(observation, known.independent)
-    found = standard_deviations(
+    found, columns = observation.about(known.independent, lambda some, columns: standard_deviations(
         replace(observation, regression=some), estimator, source, estimation.t, estimation.states,
         columns,
-    )
+    ))
     if isinstance(found, str):
         return estimation, found
     p = estimation.parameters.shape[2]
@@ -362,7 +359,9 @@ def _estimate(
     about_own = observation.names is None and observation.estimator is None
     determined = known.parameters[-1] if about_own else np.ones(p, dtype=bool)
     seen = seen if about_own else np.ones(n, dtype=bool)
-    plain, columns = _estimates(estimator, observation, grid, kept, known.independent)
+    plain, columns = observation.about(
+        known.independent, lambda some, _: estimators.estimate(estimator, some, grid, kept)
+    )
     requirement, held = plain.requirement, None
     if observation.bounds:
         held = bounded(observation.bounds, system, observation, columns, plain, grid)
@@ -415,42 +414,3 @@ def _estimate(
         still=doubts.still(parameters, requirement, natural),
     )
     return result, accuracy.metrics_of(numbers, observation.parameters, system)
-
-
-def _estimates(
-    estimator: estimators.Estimator, observation: Observation, grid: Array, kept: Array,
-    columns: IntArray,
-) -> tuple[estimators.Estimates, IntArray]:
-    """The estimates of some of the parameters, and of which: all, where settings are one each."""
-    some, columns = _about(observation, columns)
-    try:
-        return estimators.estimate(estimator, some, grid, kept), columns
-    except ConfigError:
-        if some is observation.regression:
-            raise
-        # As many numbers in its settings as parameters.
-        whole = observation.regression
-        return estimators.estimate(estimator, whole, grid, kept), np.arange(whole.p)
-
-
-def _about(observation: Observation, columns: IntArray) -> tuple[LinearRegression, IntArray]:
-    """The regression about some of the parameters, the others being zero, and about which.
-
-    About all, where what is zero at one time is not what has to be zero at another.
-    """
-    whole = observation.regression
-    plain = replace(observation, regression=replace(whole, resets=(), dynamics=None))
-    others, moving = ~np.isin(np.arange(whole.p), columns), whole.dynamics
-    stay = all(reset.leaves(others) for reset in whole.resets)
-    stay &= moving is None or moving.leaves(others)
-    if len(columns) in (0, whole.p) or plain.of_constants is None or not stay:
-        return whole, np.arange(len(observation.parameters))
-    return replace(
-        whole, psi=Trajectory(whole.mesh, whole.psi.values[..., columns]),
-        resets=tuple(reset.about(columns) for reset in whole.resets),
-        dynamics=moving and moving.about(columns),
-        parameters=tuple(whole.parameters[j] for j in columns),
-        factor=None if whole.factor is None else whole.factor[:, [*columns, whole.p]],
-        scale=np.broadcast_to(whole.scale, (whole.mesh.size, whole.p))[:, columns],
-        units=np.broadcast_to(whole.units, whole.p)[columns],
-    ), columns

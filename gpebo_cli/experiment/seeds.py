@@ -9,11 +9,13 @@ Where it does (matrices along noisy signals, resets at estimates), every seed is
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.estimators import Estimates, estimate
+from gpebo_cli.estimators import estimate
 from gpebo_cli.experiment.limits import Pace
 from gpebo_cli.experiment.noise import (
     NoiseLevels,
@@ -25,7 +27,7 @@ from gpebo_cli.experiment.noise import (
     sampled_mesh,
 )
 from gpebo_cli.experiment.result import NoiseStatistics
-from gpebo_cli.model.descriptor import Array
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers._base import Observation, Response
 from gpebo_cli.regression.estimator import Estimator
@@ -62,34 +64,35 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
     theta: Array, estimator: Estimator, levels: NoiseLevels, pace: Pace,
+    columns: IntArray, told: BoolArray,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
     The observation is of the noisy signals of ``seed``, ``observe`` makes others, ``signals`` are
-    the true ones, and ``theta`` (1, q) is what the unknowns really are at the horizon.
+    the true ones, and ``theta`` (1, q) is what the unknowns really are at the horizon. As in the
+    run, of parameters that others can stand for those of some ``columns`` are estimated, and of
+    those that are not ``told`` (p,) nothing is.
     """
     horizon = observation.regression.mesh.edges[-1:]
     settings = levels.settings
     seeds = range(settings.seed, settings.seed + settings.seeds)
     done = pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases")
 
-    def estimated() -> Iterator[tuple[Observation, Estimates]]:
+    def observed() -> Iterator[Observation]:
         if observation.respond is not None:
             for many in _added(observation, observation.respond, signals, levels):
-                yield observation, estimator.estimate(many, horizon)
+                yield replace(observation, regression=many)
             return
         for seed in seeds:
-            own = observe(measure(signals, levels, seed))
-            yield own, estimate(own.estimator or estimator, own.regression, horizon)
+            yield observe(measure(signals, levels, seed))
 
     found = list[Array]()
-    for own, estimates in estimated():
-        values = estimates.parameters(slice(None))[:, 0]
-        each = values if values.ndim == 3 else values[..., None]  # of several seeds, or of one
-        truth = _truth(own, horizon, theta, signals)
+    for own in observed():
+        each, truth = _at(horizon, own, estimator, columns), _truth(own, horizon, theta, signals)
         found.append(_with_unknowns(each, own.regression, horizon) - truth[:, None])
         done(sum(part.shape[-1] for part in found))
     error, S = np.concatenate(found, axis=-1), observation.regression.parametrisation
+    error[:, : len(told)][:, ~told] = np.nan
     return NoiseStatistics(
         seeds=settings.seeds,
         t=float(horizon[0]),
@@ -99,6 +102,18 @@ def over_seeds(
         deviation=error.std(axis=-1, ddof=1),
         rms=np.sqrt(np.mean(error**2, axis=-1)),
     )
+
+
+def _at(horizon: Array, own: Observation, estimator: Estimator, columns: IntArray) -> Array:
+    """η̂ (g, p, c) at the horizon, of several seeds at once or of one."""
+    by = own.estimator or estimator
+    made = by.estimate if own.regression.realisations else partial(estimate, by)
+    found, some = own.about(columns, lambda about, _: made(about, horizon))
+    values = found.parameters(slice(None))[:, 0]
+    values = values if values.ndim == 3 else values[..., None]
+    eta = np.zeros((len(values), len(own.parameters), values.shape[2]))
+    eta[:, some] = values
+    return eta
 
 
 def _with_unknowns(eta: Array, regression: LinearRegression, horizon: Array) -> Array:

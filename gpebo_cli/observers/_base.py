@@ -6,15 +6,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from gpebo_cli.errors import ConfigError, check_memory
 from gpebo_cli.findings import Assumption
-from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, differential_order
+from gpebo_cli.model.descriptor import (
+    Array,
+    BoolArray,
+    DescriptorSystem,
+    IntArray,
+    differential_order,
+)
 from gpebo_cli.model.expressions import on_their_side
 from gpebo_cli.model.text import sided
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
@@ -32,6 +39,7 @@ _HELD = 3  # arrays of every kind that are alive at once; measured
 _KEPT, _BESIDE = 1.15, 30  # the same of windows, and numbers that deviations hold for a sample
 _LARGE = 32  # parameters, from which on gains are not sampled for one case
 
+T = TypeVar("T")
 ByName = float | Sequence[float] | Mapping[str, float]
 
 # η̂ (g, M, p) at fixed times -> x̂ (g, M, n), NaN for a state the observer does not see
@@ -282,6 +290,21 @@ class Observation:
         regression, constant = self.regression, self.estimator is None and self.names is None
         constant &= not regression.resets and regression.dynamics is None
         return self.state_map if constant and isinstance(self.state_map, AffineStateMap) else None
+
+    def about(
+        self, columns: IntArray, make: Callable[[LinearRegression, IntArray], T]
+    ) -> tuple[T, IntArray]:
+        """What is made of the regression about some of its parameters, and which these are, (k,).
+
+        The others are zero. They are all where settings have as many numbers as parameters.
+        """
+        whole = self.regression
+        still = replace(self, regression=replace(whole, resets=(), dynamics=None)).of_constants
+        if 0 < len(columns) < whole.p and still is not None and whole.leaves(columns):
+            with suppress(ConfigError):
+                return make(whole.about(columns), columns), columns
+        every = np.arange(len(self.parameters))
+        return make(whole, every), every
 
 
 # (η̂ (g, K, p), G (K, p, p)) -> x̂ (g, K, n) and ∂x̂/∂η̂ (g, K, n, p)

@@ -71,6 +71,25 @@ class LinearRegression:
         """The mesh of all signals."""
         return self.psi.mesh
 
+    def leaves(self, columns: IntArray) -> bool:
+        """Whether parameters other than these (k,) go on as they are, through resets as well."""
+        others = ~np.isin(np.arange(self.p), columns)
+        moving = () if self.dynamics is None else (self.dynamics,)
+        return all(part.leaves(others) for part in (*self.resets, *moving))
+
+    def about(self, columns: IntArray) -> LinearRegression:
+        """The same about some of its parameters (k,), the others being zero."""
+        K, p = self.mesh.size, self.p
+        return replace(
+            self, psi=Trajectory(self.mesh, self.psi.values[..., columns]),
+            resets=tuple(reset.about(columns) for reset in self.resets),
+            dynamics=self.dynamics and self.dynamics.about(columns),
+            parameters=tuple(self.parameters[j] for j in columns),
+            factor=None if self.factor is None else self.factor[:, [*columns, p]],
+            scale=np.broadcast_to(self.scale, (K, p))[:, columns],
+            units=np.broadcast_to(self.units, p)[columns],
+        )
+
     @property
     def realisations(self) -> tuple[int, ...]:
         """(c,) if Y has that axis, else ()."""

@@ -101,7 +101,8 @@ def noise_table(noise: NoiseStatistics) -> list[str]:
     cases = range(min(len(noise.bias), _SHOWN_CASES // max(1, len(noise.names)) or 1))
     numbers = (noise.bias, noise.deviation, noise.rms)
     body = [
-        [str(case), name, *(f"{values[case, i]:.2e}" for values in numbers)]
+        [str(case), name,
+         *(f"{values[case, i]:.2e}".replace("nan", "unknown") for values in numbers)]
         for case in cases
         for i, name in enumerate(noise.names)
     ]
