@@ -121,7 +121,8 @@ def jumps(
                 f"(residual {residual.max() / scale:.1e}): no state after it satisfies the "
                 "equations; use an input without it, or a horizon that ends before"
             )
-        made_of = np.abs(inverse) @ np.abs(right)
+        terms = np.abs(form.f2[k]) + np.abs(A2) @ np.abs(before)
+        made_of = np.abs(inverse[:, levels * n :]) @ (terms / size[levels * n :])
         w[n:][np.abs(w[n:]) <= _IMPULSE * made_of[n:]] = 0.0
         w = w.reshape(levels, n)
         # E or A may jump only where it is not multiplied by an impulse.
