@@ -122,8 +122,9 @@ def jumps(
                 "equations; use an input without it, or a horizon that ends before"
             )
         terms = np.abs(form.f2[k]) + np.abs(A2) @ np.abs(before)
-        made_of = np.abs(inverse[:, levels * n :]) @ (terms / size[levels * n :])
-        w[n:][np.abs(w[n:]) <= _IMPULSE * made_of[n:]] = 0.0
+        terms, of = terms / size[levels * n :], np.abs(inverse[n:, levels * n :])
+        rounding = _IMPULSE * of @ terms + _ROUNDING * _EPS * of.max(initial=0.0) * terms.sum()
+        w[n:][np.abs(w[n:]) <= rounding] = 0.0
         w = w.reshape(levels, n)
         # E or A may jump only where it is not multiplied by an impulse.
         for name, all_changes, factors in zip("EA", changes, (w, w[1:]), strict=True):
