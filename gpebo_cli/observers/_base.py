@@ -299,10 +299,11 @@ class Observation:
         The others are zero. They are all where settings have as many numbers as parameters.
         """
         whole = self.regression
-        still = replace(self, regression=replace(whole, resets=(), dynamics=None)).of_constants
-        if 0 < len(columns) < whole.p and still is not None and whole.leaves(columns):
+        if 0 < len(columns) < whole.p and whole.leaves(columns):
+            still = replace(self, regression=replace(whole, resets=(), dynamics=None))
             with suppress(ConfigError):
-                return make(whole.about(columns), columns), columns
+                if still.of_constants is not None:
+                    return make(whole.about(columns), columns), columns
         every = np.arange(len(self.parameters))
         return make(whole, every), every
 
