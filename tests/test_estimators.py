@@ -16,7 +16,6 @@ from scipy.integrate import cumulative_trapezoid, quad_vec, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
-from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
@@ -30,6 +29,7 @@ from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.findings import would_do
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.plain_yaml import parse
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 

@@ -21,8 +21,8 @@ from processes import assert_refused, refused
 
 from gpebo_cli import run
 from gpebo_cli.configs.configuration import KEYS
-from gpebo_cli.configs.text import dump, parse
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.plain_yaml import dump, parse
 
 REGRESSION = "name: mine\nunknowns: {a: 1}\nsignals: {u: sin(t), y: sin(t)}\nY: [y]\npsi: [[u]]\n"
 RECIPE = "time: {horizon: 0.1, samples: 3}\nfigures: none\n"

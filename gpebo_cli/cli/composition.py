@@ -35,8 +35,8 @@ from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS, explain
 from gpebo_cli.configs import files
 from gpebo_cli.configs.locations import GROUPS, choices, conf_folder
-from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.plain_yaml import parse
 
 _INSTANTIATED = ("hydra.launcher._target_", "hydra.sweeper._target_")
 _CLOSES = {"(": ")", "[": "]", "{": "}", "'": "'", '"': '"'}

@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from gpebo_cli.configs.locations import LOOK
-from gpebo_cli.configs.text import dump
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.plain_yaml import dump
 from gpebo_cli.schema import convert, read, shown, unknown
 from gpebo_cli.settings import (
     DataSettings,

@@ -15,8 +15,8 @@ from typing import Any
 
 from gpebo_cli.configs.configuration import KEYS
 from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, PRIMARY, conf_folder
-from gpebo_cli.configs.text import parse
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.plain_yaml import parse
 from gpebo_cli.reading import read_text
 from gpebo_cli.schema import plain, shown, unknown
 

@@ -71,12 +71,9 @@ def from_file(
     if file.suffix.lower() in NETLISTS:
         return from_netlist(file, name, measure=measure, unknown=unknown)
     if file.suffix.lower() in (".yaml", ".yml"):
-        import yaml
+        from gpebo_cli.plain_yaml import parse
 
-        try:
-            content = yaml.safe_load(read_text(path, _MAX_TEXT))
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path} is not YAML ({' '.join(str(error).split())})") from None
+        content = parse(read_text(path, _MAX_TEXT), str(path))
         if not isinstance(content, dict):
             raise ConfigError(f"{path}: expected a mapping with M, D, K, G")
         draft = from_mechanics(content, name, str(path))
