@@ -116,8 +116,7 @@ def units_at(c: Coefficients) -> Units:
     factors /= np.log(10.0)
     linked = there[0] | there[1]
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
-    i, j = linked.nonzero()
-    first, one = _first_of_each_part(i, j, outputs_first), linked.argmax(axis=0)
+    first, one = _first_of_each_part(linked, outputs_first), linked.argmax(axis=0)
     start = _references(factors[: n + r], first, (first >= n) == (np.arange(n + r) >= n))
     of_row = np.rint(start - factors[: n + r] + _BESIDE_TIES)
     of_column = np.rint(factors[n + r : -1] + start[one] + _BESIDE_TIES) - of_row[first][one]
@@ -222,15 +221,13 @@ def _balancing(
     return terms, partial(np.matmul, -inverse @ (each * counts))
 
 
-def _first_of_each_part(i: IntArray, j: IntArray, order: IntArray) -> IntArray:
-    """For each row (a,) the first one, in this ``order``, of those that columns link it to.
-
-    Entries that are not zero are in rows i and columns j.
-    """
+def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:
+    """For each row (a,) the first one, in this order, of those that columns link it to."""
     place = np.empty(len(order), dtype=np.intp)
     place[order] = np.arange(len(order))
+    i, j = linked.nonzero()
     while True:
-        of_column = np.full(j.max(initial=0) + 1, len(order))
+        of_column = np.full(linked.shape[1], len(order))
         np.minimum.at(of_column, j, place[i])
         nearer = place.copy()
         np.minimum.at(nearer, i, of_column[j])
@@ -240,7 +237,7 @@ def _first_of_each_part(i: IntArray, j: IntArray, order: IntArray) -> IntArray:
         place = nearer
 
 
-def _references(decades: Array, first: IntArray, counted: BoolArray | bool = True) -> Array:
+def _references(decades: Array, first: IntArray, counted: BoolArray) -> Array:
     """From where rows (a,) of these ``decades`` are counted in whole ones: (a,) alike in a part.
 
     Opposite of the widest gap that the ``counted`` rows of the part leave between what they are
