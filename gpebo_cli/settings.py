@@ -37,8 +37,19 @@ class TimeSettings:
     samples: int = within(1001, 2, 1_000_000)
 
 
+@dataclass(frozen=True, kw_only=True)
+class TableFormat:
+    """How a file has its samples."""
+
+    time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"  # of t in the file
+    separator: str = ","  # between cells: a character, or comma, semicolon, tab, space
+    decimal: Literal[".", ","] = "."
+    missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"  # of empty cells and nan
+    gaps: list[float] | None = None  # numbers in the file that mean the same as an empty cell
+
+
 @dataclass(frozen=True)
-class DataSettings:
+class DataSettings(TableFormat):
     """Where u and y come from: the simulated plant, or a recording."""
 
     name: Literal["none", "csv"] = "none"
@@ -48,11 +59,6 @@ class DataSettings:
     hold: Between | Mapping[str, Between] = "linear"
     columns: Mapping[str, str] | None = None  # what a signal (t, V, y) is called in the file
     scale: Mapping[str, float] | None = None  # by signal: from the file's unit to ours
-    time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"  # of t in the file
-    separator: str = ","  # between cells: a character, or comma, semicolon, tab, space
-    decimal: Literal[".", ","] = "."
-    missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"  # of empty cells and nan
-    gaps: list[float] | None = None  # numbers in the file that mean the same as an empty cell
     frame: object = None  # from Python: a pandas.DataFrame in place of a file
 
 

@@ -200,6 +200,17 @@ def test_a_plant_that_has_changed_is_not_mixed_with_the_old_one(tmp_path, swept)
     assert_refused(done, "a configuration file has changed")
 
 
+@pytest.mark.parametrize("swept", [["estimator.gamma=1,2"], ["data.file=other.csv,rows.csv"]])
+def test_a_recording_that_has_changed_is_not_mixed_with_the_old_one(tmp_path, swept):
+    for name in ("rows.csv", "other.csv"):
+        (tmp_path / name).write_text("t,V,y\n0,0,1\n0.5,0,1\n1,0,1\n")
+    words = ["run", "-m", "data=csv", "data.file=rows.csv", *swept, *FAST, "hydra.sweep.dir=sweep"]
+    gpebo(*words, cwd=tmp_path)
+    assert gpebo(*words, "resume=sweep", "--dry-run", cwd=tmp_path).returncode == 0
+    (tmp_path / "rows.csv").write_text("t,V,y\n0,0,1\n0.5,0,2\n1,0,1\n")
+    assert_refused(gpebo(*words, "resume=sweep", cwd=tmp_path), "such as a recording")
+
+
 # Interrupted and resumed ----------------------------------------------------------------------
 
 

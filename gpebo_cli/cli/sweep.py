@@ -7,9 +7,10 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, cast
@@ -28,6 +29,7 @@ from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
+from gpebo_cli.model.archive import ARCHIVE
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.files import csv_text, make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
@@ -43,6 +45,7 @@ _NAMED_FAILURES = 5  # in the last line; results.csv has all
 _SHOWN_ROWS = 20
 _MAX_JOBS = 100_000
 _SUBDIR = "${hydra:job.num}"
+_DESCRIPTIONS = "", "plant", "regression"  # folders of files that name others
 
 
 def run_sweep_job(cfg: DictConfig, arguments: Arguments, starter: int) -> None:
@@ -213,13 +216,35 @@ def _unquoted(value: str) -> str:
 
 
 def _digest(configs: Iterable[DictConfig]) -> str:
-    """Digest of what the jobs are made of: a resumed sweep must not mix two versions of a plant."""
+    """Digest of what the jobs are made of: a resumed sweep must not mix two versions of a plant.
+
+    Recordings and other files that configurations name count by their content.
+    """
     found = hashlib.sha256()
     for config in configs:
+        places = [
+            os.path.join(source.path, group)
+            for source in config.hydra.runtime.config_sources for group in _DESCRIPTIONS
+        ]
         content = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=False))
         content.pop("hydra", None)
         found.update(OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True).encode())
+        for file, place in product(_files(content), ["", *places]):
+            if os.path.isfile(path := os.path.join(place, file)):
+                with open(path, "rb") as stream:
+                    found.update(hashlib.file_digest(stream, "sha256").digest())
     return found.hexdigest()[:16]
+
+
+def _files(content: object) -> Iterator[str]:
+    """What a configuration names: recordings, tables of inputs, archives of matrices."""
+    if isinstance(content, Mapping):
+        for key, value in content.items():
+            if key in ("file", ARCHIVE):
+                named = value if isinstance(value, list) else [value]
+                yield from (each for each in named if isinstance(each, str))
+            else:
+                yield from _files(value)
 
 
 def _compositions(
@@ -235,7 +260,7 @@ def _compositions(
     for job in jobs:
         pairs = [text.partition("=") for text in job]
         kind = tuple(
-            (key, value if "/" in key or key.lstrip("+~") in GROUPS else "")
+            (key, value if key.lstrip("+~") in (*GROUPS, "data.file") or "/" in key else "")
             for key, _, value in pairs
         )
         if kind not in seen:
@@ -271,8 +296,8 @@ def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
             )
     if there.configuration != plan.configuration:
         raise ConfigError(
-            f"resume={name}: a configuration file has changed since that sweep began; begin a new "
-            "one"
+            f"resume={name}: a configuration file has changed since that sweep began, or a file "
+            "that it names, such as a recording; begin a new one"
         )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 
@@ -21,24 +21,19 @@ from gpebo_cli.model.text import Piecewise, TextCoefficients
 from gpebo_cli.reading import beside
 from gpebo_cli.recordings.hold import bends
 from gpebo_cli.recordings.table import TIME, read_table
-from gpebo_cli.schema import read
-from gpebo_cli.settings import DataSettings
+from gpebo_cli.schema import keys, read
+from gpebo_cli.settings import Between, DataSettings, TableFormat
 
 
 @dataclass(frozen=True)
-class _Given:
+class _Given(TableFormat):
     """What a plant's file says of such an input; keys as of ``data``."""
 
     file: str
     column: str | None = None  # by default the input's name
     time: str = TIME  # the column of times
-    hold: Literal["zoh", "linear", "cubic"] = "linear"
+    hold: Between = "linear"
     scale: float = 1.0
-    time_unit: Literal["s", "ms", "min", "h", "datetime"] = "s"
-    separator: str = ","
-    decimal: Literal[".", ","] = "."
-    missing: Literal["refuse", "hold", "interpolate", "drop"] = "refuse"
-    gaps: list[float] | None = None
 
 
 def tables(
@@ -82,8 +77,7 @@ def _piecewise(name: str, content: Mapping[str, object], where: str, source: str
     column = given.column or name
     data = DataSettings(
         name="csv", file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
-        time_unit=given.time_unit, separator=given.separator, decimal=given.decimal,
-        missing=given.missing, gaps=given.gaps,
+        **{key: getattr(given, key) for key in keys(TableFormat)},
     )
     alone = DescriptorSystem(  # of which the table is a recording; its matrices are not read
         where, (), None, np.zeros(0), inputs=(name,),  # type: ignore[arg-type]
