@@ -99,9 +99,10 @@ def test_bounds_are_not_much_wider_than_they_must_be():
 
 
 @pytest.mark.parametrize(("w", "duty"), [(10, 1e-3), (100, 1e-2), (37, 1e-5)])
-def test_pulse_width_modulation_by_sign(w, duty):
+@pytest.mark.parametrize("pulses", ["(1 + sign({}))/2", "step({})"])
+def test_pulse_width_modulation(w, duty, pulses):
     """Every pulse has the area 2π/w, the first one starts in its middle."""
-    text = f"(1 + sign(cos({w}*t) - cos(pi*{duty})))/(2*{duty})"
+    text = f"{pulses.format(f'cos({w}*t) - cos(pi*{duty})')}/{duty}"
     periods = np.floor(20 * w / (2 * np.pi))
     rounding = max(1e-9, 1e-16 / duty**2)  # of the argument, against its slope where it is zero
     np.testing.assert_allclose(integrated(text), (0.5 + periods) * 2 * np.pi / w, rtol=rounding)

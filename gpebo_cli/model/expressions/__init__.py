@@ -2,9 +2,8 @@
 
 Numbers, names, ``+ - * / **``, ``t``, ``pi``, ``sin cos tan asin acos atan exp log sqrt sinh cosh
 tanh asinh acosh atanh erf abs sign``, ``min`` and ``max`` of two, ``d(.)`` for the time derivative,
-and ``step(t - t1)``, which is 0 before t1 and 1 from t1 on (its argument may be any affine function
-of t; a falling one gives 1 before and 0 from t1 on). Names may be those of signals: what depends
-on them is evaluated along their Taylor coefficients.
+and ``step(.)``, which is 0 where its argument is negative and 1 where it is positive. Names may be
+those of signals: what depends on them is evaluated along their Taylor coefficients.
 
 Text is read by :func:`parse` into graphs of ``nodes``, recorded on a :class:`Tape` and evaluated
 in Taylor arithmetic (``jets``): derivatives of any order, no code generation, nothing executed.

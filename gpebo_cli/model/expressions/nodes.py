@@ -229,14 +229,11 @@ def extremum(name: str, a: Node, b: Node) -> Node:
 
 
 def step(a: Node) -> Node:
-    """0 before the instant at which the affine argument passes zero, 1 from then on.
-
-    A falling argument gives 1 before and 0 from then on: step(t1 - t) = 1 - step(t - t1).
-    """
+    """0 where the argument is negative, 1 where it is positive: step(t1 - t) = 1 - step(t - t1)."""
     if a.is_number:
         raise FoldError("the argument of step does not depend on t")
     if a.affine is None:
-        raise FoldError("the argument of step must be affine in t, such as step(t - 2)")
+        return multiply(number(0.5), add(ONE, function("sign", a)))
     offset, slope = a.affine
     rising = _node("step", value=_fold(lambda c, s: -c / s, offset, slope).value, smooth=0.0)
     return rising if slope > 0 else subtract(ONE, rising)

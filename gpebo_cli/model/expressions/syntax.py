@@ -44,7 +44,7 @@ _BINARY: dict[type[ast.operator], Callable[[Node, Node], Node]] = {
     ast.Pow: nodes.power,
 }
 _ACCEPTED = "accepted: numbers, names, + - * / **, t, pi, " + ", ".join(
-    [*nodes.FUNCTIONS, "min(., .), max(., .), d(.), step(t - t1)"]
+    [*nodes.FUNCTIONS, "min(., .), max(., .), d(.), step(.)"]
 )
 _FOREIGN = re.compile(r"[^A-Za-z0-9_.+\-*/(), \t\r\n]")
 
