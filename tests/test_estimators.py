@@ -231,6 +231,17 @@ def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance
     assert np.abs(found - expected).max() < tolerance
 
 
+@pytest.mark.parametrize("name", ["drem", "lion", "mre"])
+def test_a_row_that_no_parameter_is_in_changes_no_estimate(name):
+    """An output that sees inputs only, with noise, has Y that is not zero and ψ that is."""
+    known = LinearRegression.from_functions(
+        lambda t: np.stack([0.0 * three(t), three(t)], axis=-2),
+        lambda t: np.stack([wobble(t), three(t) @ ETA + wobble(t)], axis=-1),
+        NOISY.parameters, 10.0,
+    )
+    np.testing.assert_allclose(run(name, known), run(name, NOISY), rtol=1e-9, atol=1e-12)
+
+
 def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
     """‖F‖ of what is not excited is logistic, and z = 1/(f₀‖F‖) its reciprocal."""
     row, f0, bound = np.array([0.6, 0.8]), 1e-4, 1e6

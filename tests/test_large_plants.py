@@ -275,6 +275,33 @@ def test_a_change_of_units_and_signs_changes_nothing(build, rate, varying):
     assert len(x) / 3 < len(y) < 3 * len(x)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_units_of_unconnected_states_do_not_lend_each_other_rounding(seed):
+    """Oscillators and N x' = x + u; a derivative of u jumps, so that the derivative array is used.
+
+    Units are powers of two: what nothing mixes has the same digits in all of them.
+    """
+    n = 18
+    E, A, B = np.eye(n), np.diag(np.linspace(-2.0, 0.0, n)), np.ones((n, 1))
+    E[16:, 16:], A[16:, 16:] = [[0.0, 1.0], [0.0, 0.0]], np.eye(2)
+    for k in range(0, 16, 2):
+        A[k, k + 1], A[k + 1, k] = 2.0, -1.0
+    rng, start = np.random.default_rng(seed), np.append(np.ones(16), [0.0, -1.0])
+    order, spread = rng.permutation(n), 2.0 ** rng.integers(-20, 21, n // 2).repeat(2)
+
+    def found(units):
+        system = plant_from_mapping({
+            "name": "apart", "states": [f"x{k}" for k in range(n)], "B": B[order],
+            "inputs": {"u": "sin(t) + step(t - 1)*(t - 1)"}, "E": (E * units)[order],
+            "A": (A * units)[order], "initial_state": (start / units).tolist(),
+        }, "apart")
+        x = simulate.simulate(system, TimeSettings(horizon=2.0), SolverSettings()).signals.states
+        return x(np.linspace(0.0, 2.0, 9)) * units
+
+    x = found(np.ones(n))
+    np.testing.assert_allclose(found(spread), x, rtol=1e-13, atol=1e-14 * np.abs(x).max())
+
+
 @pytest.mark.parametrize(("matrix", "k"), [("E", 2), ("A", -1)])
 @pytest.mark.parametrize("factor", ["sin(t - 4)", "(0.01 + (t - 4)**2)"])
 def test_pivots_that_come_near_zero_are_left_to_the_derivative_array(matrix, k, factor):

@@ -362,6 +362,27 @@ def test_a_jump_that_is_large_hides_no_impulse_beside_it(size):
     np.testing.assert_allclose(jump.impulses, [[0, 0, 1, 0]], atol=1e-12)
 
 
+@pytest.mark.parametrize(("seed", "slow"), [(59, 3), (117, 3), (70, 4), (105, 5), (122, 7)])
+def test_what_constraints_make_zero_has_no_impulse(seed, slow):
+    """N x' = x is zero; mixed with other states, in all equations, it is their rounding."""
+    rng, n = np.random.default_rng(seed), slow + 2
+    left, right = np.eye(n), np.eye(n)
+    for mixed in (left, right):
+        for _ in range(2 * n):
+            i, j = rng.choice(n, 2, replace=False)
+            mixed[i] += rng.choice([-1.0, 1.0, 0.5]) * mixed[j]
+    E, A = np.diag([1.0] * slow + [0.0, 0.0]), np.eye(n)
+    E[slow, slow + 1], A[:slow, :slow] = 1.0, np.diag(-rng.integers(1, 9, slow) / 4)
+    start = np.append(rng.integers(-3, 4, slow), [0, 0])
+    system = plant(
+        states=[f"x{k}" for k in range(n)], inputs={"u": "sin(t) + step(t - 1)*(t - 1)"},
+        E=left @ E @ right, A=left @ A @ right, B=left[:, :slow].sum(axis=1, keepdims=True),
+        initial_state=np.linalg.solve(right, start).tolist(),
+    )
+    ((_, _, jump),) = simulate(system, TimeSettings(horizon=2.0), SOLVER).jumps
+    assert not jump.impulses.any()
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_jump_whose_equations_stay_unsolved_is_refused(sign, monkeypatch):
     system = plant(states=["x", "z"], inputs={"u": f"1 + {2 * sign}*step(t - 1.5)"},

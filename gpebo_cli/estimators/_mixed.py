@@ -77,10 +77,11 @@ class FilteredEstimator(ResumableEstimator):
         """
         p, rates = regression.p, filter_rates(self.rates, regression.parameters)
         extended = self.extend(regression, rates, known[0].values if known else None)
+        seen = self.seen(regression)
 
         def at(t: Array, inside: Array) -> tuple[Array, Array, Array]:
             delta, adjugate = determinant_and_adjugate(extended(t, inside)[..., :p])
-            return rates[:, None] * self.seen(regression.psi(t, inside)), delta, adjugate
+            return rates[:, None] * seen(t, inside), delta, adjugate
 
         return rates, at
 
@@ -97,9 +98,9 @@ class FilteredEstimator(ResumableEstimator):
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""
         return RecursiveMixed(self, parameters, self.mixing(parameters), mu=mu)
 
-    def seen(self, psi: Array) -> Array:
-        """What the filters of 𝒴 take of Y: ψᵀ (N, p, rows) of ψ (N, rows, p)."""
-        return transpose(psi)
+    def seen(self, regression: LinearRegression) -> Callable[[Array, Array], Array]:
+        """What the filters of 𝒴 take of Y at times (N,): ψᵀ (N, p, rows)."""
+        return lambda t, inside: transpose(regression.psi(t, inside))
 
     def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
         """Filtered [ψᵀψ | ψᵀY] (p, p + c), with the ``rates`` (p,), from ``start`` or 0."""

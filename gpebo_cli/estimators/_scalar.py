@@ -16,8 +16,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import affine_scan, determinant_and_adjugate_action, reciprocals
+from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics.linalg import (
+    affine_scan,
+    determinant_and_adjugate_action,
+    largest_over_time,
+    reciprocals,
+)
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, legendre_tail, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.regression.linear import (
@@ -33,6 +38,7 @@ MixedSignals = Callable[[Array, Array], tuple[Array, Array, Array]]
 # Relative variation of η̄, weighted by what it can do: below the first η̄ counts as constant, below
 # the second as linear in I between neighbouring points, which is then accurate enough.
 _CONSTANT, _SMALL = 1e-13, 1e-8
+_VANISHING = 1e-11  # of a parameter's largest entry in ψ: less is rounding
 _TOLERANCE = 1e-10
 MAX_ELEMENTS = 20_000
 _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
@@ -85,14 +91,21 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
 def lion(regression: LinearRegression, rates: Array, start: Array | None = None) -> Trajectory:
     """[Ω | 𝒴] of shape (p, p + c), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
 
-    Row i takes row i mod r of the regression: with one output every row is a filtered copy of the
-    same ψ, and rates must differ for Ω to be invertible.
+    Of those :func:`lion_rows`: with one output every row is a filtered copy of the same ψ, and
+    rates must differ for Ω to be invertible.
     """
     psi = regression.psi.values
     both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
-    rows = np.arange(regression.p) % both.shape[2]
-    signal = Trajectory(regression.mesh, both[:, :, rows])
+    signal = Trajectory(regression.mesh, both[:, :, lion_rows(regression)])
     return low_pass(signal, rates[:, None], start)
+
+
+def lion_rows(regression: LinearRegression) -> IntArray:
+    """Row i of p takes row i mod r of the r rows in which ψ does not vanish."""
+    whole = regression.whole or regression
+    size = largest_over_time(whole.psi.values, 2)
+    rows = np.flatnonzero((size > _VANISHING * size.max(axis=0, initial=0.0)).any(axis=1))
+    return np.resize(rows if len(rows) else np.arange(len(size)), regression.p)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gpebo_cli.estimators._mixed import FilteredEstimator
 from gpebo_cli.estimators._recursive import KreisselmeierFilter
-from gpebo_cli.estimators._scalar import lion
+from gpebo_cli.estimators._scalar import lion, lion_rows
 from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
@@ -26,10 +27,10 @@ class Lion(FilteredEstimator):
         """Filtered rows of [ψ | Y], shape (p, p + c)."""
         return lion(regression, rates, start)
 
-    def seen(self, psi: Array) -> Array:
-        """Row i takes row i mod r of the regression: (N, p, rows) of ψ (N, rows, p)."""
-        rows, p = psi.shape[1:]
-        return np.broadcast_to(np.eye(rows)[np.arange(p) % rows], (len(psi), p, rows))
+    def seen(self, regression: LinearRegression) -> Callable[[Array, Array], Array]:
+        """Rows that are taken, (N, p, rows)."""
+        taken = np.eye(regression.psi.values.shape[2])[lion_rows(regression)]
+        return lambda t, _: np.broadcast_to(taken, (len(t), *taken.shape))
 
     def at_samples(self, rates: Array) -> KreisselmeierFilter:
         """The filters, with rates of shape (p,), where no row is known before its sample."""

@@ -21,6 +21,7 @@ import numpy as np
 from gpebo_cli.kernels.arrays import Array, BoolArray, IntArray, inverses
 
 _TINY = float(np.finfo(float).tiny)
+_ROUNDING = 1e-13  # of a basis of which columns have one entry of 1 each
 
 
 def scaled(
@@ -114,8 +115,18 @@ def reference(
     if count > len(rows):
         everything = np.arange(len(M))
         return count, smallest[0], everything, everything, np.zeros((len(rows), 0))
-    Z1 = np.linalg.svd(e[0, 0] @ T2[0], full_matrices=False)[0]
+    Z1 = _with_zeros(np.linalg.svd(e[0, 0] @ T2[0], full_matrices=False)[0])
     return count, smallest[0], *_pivots(M, len(M) - count), Z1
+
+
+def _with_zeros(basis: Array) -> Array:
+    """An orthonormal basis (n, d) of the same range, where unconnected states stay apart.
+
+    Singular vectors mix them, and then the rounding of one is in all of the others.
+    """
+    axes = _pivots(basis @ basis.T, basis.shape[1])[0][: basis.shape[1]]
+    found = basis @ inverses(basis[None, axes])[0]
+    return np.linalg.qr(np.where(np.abs(found) > _ROUNDING, found, 0.0))[0]
 
 
 def _pivots(matrix: Array, count: int) -> tuple[IntArray, IntArray]:

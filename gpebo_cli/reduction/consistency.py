@@ -123,7 +123,8 @@ def jumps(
             )
         terms = np.abs(form.f2[k]) + np.abs(A2) @ np.abs(before)
         terms, of = terms / size[levels * n :], np.abs(inverse[n:, levels * n :])
-        rounding = _IMPULSE * of @ terms + _ROUNDING * _EPS * of.max(initial=0.0) * terms.sum()
+        all_terms = terms.sum() + known[1].sum()  # a state that is made zero is rounding
+        rounding = _IMPULSE * of @ terms + _ROUNDING * _EPS * of.max(initial=0.0) * all_terms
         w[n:][np.abs(w[n:]) <= rounding] = 0.0
         w = w.reshape(levels, n)
         # E or A may jump only where it is not multiplied by an impulse.
