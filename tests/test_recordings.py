@@ -738,6 +738,18 @@ FOUND = {
     "signs for gaps": (
         "t,V,y\n0,1,2\n1,-,3\n2,3,NaN\n3,4,5\n", {"t": "t", "V": "V", "y": "y"}, {"missing": 2}
     ),
+    "microseconds": ("t_us,V,y\n0,1,2\n1,2,3\n", {"t": "t_us", "V": "V", "y": "y"},
+                     {"scale": {"t": 1e-6}}),
+    "decimal commas with exponents": (
+        "t;V;y\n0,0E+00;1,0E+00;2\n1,0E+00;2,0E+00;3\n", {"t": "t", "V": "V", "y": "y"},
+        {"separator": ";", "decimal": ","},
+    ),
+    "a date beside seconds": ("Date,Time (msec),V,y\n1.1.2024,0,1,2\n1.1.2024,1,2,3\n",
+                              {"t": "Time (msec)", "V": "V", "y": "y"}, {"time_unit": "ms"}),
+    "an output that begins late": (
+        "t,V,y\n" + "".join(f"{k},{k % 7},\n" for k in range(60)) + "60,1,2\n61,2,3\n",
+        {"t": "t", "V": "V", "y": "y"}, {"missing": 60},
+    ),
     "by elimination": ("zeit,a,y\n0,1,2\n1,2,3\n", {"t": "zeit", "V": "a", "y": "y"}, {}),
 }
 
@@ -847,6 +859,9 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     assert guess(str(path), shipped("circuit")).gaps == [-999.0]
 
 
+DAYS = "column time (days) may be in days, t is in s: data.scale.t is the factor between them"
+
+
 @pytest.mark.parametrize(("head", "time", "said"), [
     ("when,v [A],Y", "0", {
         "columns": {"t": "when", "V": "v [A]", "y": "Y"}, "time_unit": "s", "scale": {"V": 1.0},
@@ -860,6 +875,10 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
         "scale": {"y": 1e-3}, "doubts": [],
         "reasons": {"t": "by its name", "time_unit": "from the header", "V": "the same name",
                     "y": "the name is in the header", "scale.y": "mA in the header, A here"},
+    }),
+    ("time (days),V,y", "0", {
+        "time_unit": "s", "scale": {"t": 1.0},
+        "doubts": [DAYS],
     }),
     ("t,V,y,note", "later", {
         "doubts": [f"column t: 'later' is neither a number nor {DATE}", "not read: note"],
@@ -909,6 +928,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     ("m/s", "m", None), ("kg/V", "kg/s", None), ("W", "kW", 1e-3), ("W", "mW", 1e3),
     ("µA", "mA", 1e-3), ("in", "min", None), ("l/min", "m3/s", 1e-3 / 60), ("m3/h", "L/h", 1e3),
     ("°C", "degC", 1.0), ("°C", "K", None), ("cm²", "m2", 1e-4), ("mm", "m3", None),
+    ("mm/s²", "m/s2", 1e-3), ("kg/m3", "g/m3", 1e3), ("cm2/K", "m2/K", 1e-4), ("m2", "k2", None),
     ("rpm", "rad/s", np.pi / 30), ("mbar", "hPa", 1.0), ("kΩ", "ohm", 1e3), ("m", "V", None),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):
