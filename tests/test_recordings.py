@@ -170,6 +170,17 @@ def test_smooth_samples_share_elements_and_rough_ones_do_not():
         assert np.abs(mesh.along(signal)(inner) - signal(inner, inner)).max() < 1e-10
 
 
+@pytest.mark.parametrize(("rows", "stages"), [(51, 9), (20_001, 3)])
+def test_elements_have_the_nodes_that_the_plants_modes_need(rows, stages):
+    """Whatever the clock starts at; beside rows that are close a mode is a straight line."""
+    source = plant_from_mapping(one_state(A=[[-2]])).coefficients
+    for start in (0.0, 5.0):
+        t = np.linspace(start, start + 10.0, rows)
+        signals = np.sin(t)[:, None]
+        mesh = recording_mesh(t, signals, "zoh", (t[0], t[-1]), source, 1e-12)
+        assert (mesh.size, mesh.rule.stages) == (rows - 1, stages)
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
     source = shipped("circuit").coefficients
