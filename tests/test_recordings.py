@@ -573,6 +573,19 @@ def test_dates_of_a_data_frame_may_be_text():
     assert read("", frame=frame, time_unit="datetime").samples.t.tolist() == [0.0, 2.0, 60.0]
 
 
+def test_rows_without_a_time_may_be_the_first_of_a_data_frame():
+    times = pd.Series([pd.NaT, pd.Timestamp("2024-01-01"), pd.Timestamp("2024-01-01 00:00:02")])
+    for t, more in (times, {}), (times.astype(str), {"time_unit": "datetime"}):
+        frame = pd.DataFrame({"t": t, "V": 1.0, "y": 2.0})
+        assert read("", frame=frame, missing="drop", **more).samples.t.tolist() == [0.0, 2.0]
+
+
+@pytest.mark.parametrize("data", [[pd.DataFrame()], [{"t": [0, 1]}], ["a.csv", 3], 3])
+def test_what_is_neither_files_nor_a_frame_is_one_line(data):
+    with refused("data: expected a file, a list of files or one pandas.DataFrame, got"):
+        run("circuit", data=data)
+
+
 @pytest.mark.parametrize(
     ("settings", "part"),
     [
