@@ -790,6 +790,18 @@ def test_a_look_at_a_file_finds_its_columns(tmp_path, name):
     assert {key: getattr(found, key) for key in expected} == expected | more
 
 
+def test_of_columns_with_the_unit_the_most_similar_name_is_taken(tmp_path):
+    """In whatever order they stand; where the unit alone decides, a person is asked to look."""
+    plant = one_state(outputs=["v_out"], inputs={"v_in": "0"}, B=[[1]])
+    system = plant_from_mapping(plant | {"units": {"v_in": "V", "v_out": "V"}})
+    path = tmp_path / "lab.csv"
+    for head in "t,Vin (V),Vout (V)", "t,Vout (V),Vin (V)":
+        path.write_text(f"{head}\n0,1,2\n1,2,3\n")
+        found = guess(str(path), system)
+        assert found.columns == {"t": "t", "v_in": "Vin (V)", "v_out": "Vout (V)"}
+        assert found.reasons["v_in"] == "its unit, as of others: LOOK AT IT"
+
+
 def test_an_output_called_T_is_no_time(tmp_path):
     (tmp_path / "log.csv").write_text("Datum;T\n31.05.2024 9:00:00;1,5\n31.05.2024 9:00:01;2,5\n")
     found = guess(str(tmp_path / "log.csv"), plant_from_mapping(one_state(outputs=["T"])))

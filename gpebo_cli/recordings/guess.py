@@ -39,6 +39,7 @@ _UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milli
           "min": "min", "minutes": "min", "h": "h", "hours": "h"}
 _STEPS = 0.5  # of its rows: an input that changes at so many of them may be one that steps
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
+_BY_UNIT = "its unit"
 _LOOKED_AT = 50  # rows below the header
 _NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have nothing
 
@@ -188,9 +189,9 @@ def _likeness(signal: str, unit: str, name: str) -> tuple[float, str]:
         return 2.5, "the name is in the header"
     if signal in (*re.findall(r"\w+", name), *_words(name)):
         return 2.0, "the name is in the header"
-    if unit and any(_factor(written, unit) is not None for written in _units(name)):
-        return 1.5, "its unit"
     ratio = difflib.SequenceMatcher(None, signal.casefold(), name.casefold()).ratio()
+    if unit and any(_factor(written, unit) is not None for written in _units(name)):
+        return 1.5 + 0.4 * ratio, _BY_UNIT  # of several with that unit the most similar one
     return (ratio, "a similar name") if ratio > 0.6 else (0.0, "")
 
 
@@ -207,9 +208,11 @@ def _find_signals(
         ((_likeness(s, system.units.get(s, ""), header[k]), s, k) for s in signals for k in free),
         key=lambda pair: -pair[0][0],
     )
+    with_unit = Counter(signal for (_, why), signal, _ in pairs if why == _BY_UNIT)
     for (points, why), signal, k in pairs:
         if points > 0 and signal not in found.columns and k in free:
-            found.columns[signal], found.reasons[signal] = header[k], why
+            also = ", as of others: LOOK AT IT" * (why == _BY_UNIT and with_unit[signal] > 1)
+            found.columns[signal], found.reasons[signal] = header[k], why + also
             free.remove(k)
     left = [signal for signal in signals if signal not in found.columns]
     if left and len(left) == len(free):
