@@ -170,6 +170,17 @@ def test_smooth_samples_share_elements_and_rough_ones_do_not():
         assert np.abs(mesh.along(signal)(inner) - signal(inner, inner)).max() < 1e-10
 
 
+@pytest.mark.parametrize(("rows", "stages"), [(51, 9), (20_001, 3)])
+def test_elements_have_the_nodes_that_the_plants_modes_need(rows, stages):
+    """Whatever the clock starts at; beside rows that are close a mode is a straight line."""
+    source = plant_from_mapping(one_state(A=[[-2]])).coefficients
+    for start in (0.0, 5.0):
+        t = np.linspace(start, start + 10.0, rows)
+        signals = np.sin(t)[:, None]
+        mesh = recording_mesh(t, signals, "zoh", (t[0], t[-1]), source, 1e-12)
+        assert (mesh.size, mesh.rule.stages) == (rows - 1, stages)
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
     source = shipped("circuit").coefficients
@@ -562,6 +573,19 @@ def test_dates_of_a_data_frame_may_be_text():
     assert read("", frame=frame, time_unit="datetime").samples.t.tolist() == [0.0, 2.0, 60.0]
 
 
+def test_rows_without_a_time_may_be_the_first_of_a_data_frame():
+    times = pd.Series([pd.NaT, pd.Timestamp("2024-01-01"), pd.Timestamp("2024-01-01 00:00:02")])
+    for t, more in (times, {}), (times.astype(str), {"time_unit": "datetime"}):
+        frame = pd.DataFrame({"t": t, "V": 1.0, "y": 2.0})
+        assert read("", frame=frame, missing="drop", **more).samples.t.tolist() == [0.0, 2.0]
+
+
+@pytest.mark.parametrize("data", [[pd.DataFrame()], [{"t": [0, 1]}], ["a.csv", 3], 3])
+def test_what_is_neither_files_nor_a_frame_is_one_line(data):
+    with refused("data: expected a file, a list of files or one pandas.DataFrame, got"):
+        run("circuit", data=data)
+
+
 @pytest.mark.parametrize(
     ("settings", "part"),
     [
@@ -738,6 +762,18 @@ FOUND = {
     "signs for gaps": (
         "t,V,y\n0,1,2\n1,-,3\n2,3,NaN\n3,4,5\n", {"t": "t", "V": "V", "y": "y"}, {"missing": 2}
     ),
+    "microseconds": ("t_us,V,y\n0,1,2\n1,2,3\n", {"t": "t_us", "V": "V", "y": "y"},
+                     {"scale": {"t": 1e-6}}),
+    "decimal commas with exponents": (
+        "t;V;y\n0,0E+00;1,0E+00;2\n1,0E+00;2,0E+00;3\n", {"t": "t", "V": "V", "y": "y"},
+        {"separator": ";", "decimal": ","},
+    ),
+    "a date beside seconds": ("Date,Time (msec),V,y\n1.1.2024,0,1,2\n1.1.2024,1,2,3\n",
+                              {"t": "Time (msec)", "V": "V", "y": "y"}, {"time_unit": "ms"}),
+    "an output that begins late": (
+        "t,V,y\n" + "".join(f"{k},{k % 7},\n" for k in range(60)) + "60,1,2\n61,2,3\n",
+        {"t": "t", "V": "V", "y": "y"}, {"missing": 60},
+    ),
     "by elimination": ("zeit,a,y\n0,1,2\n1,2,3\n", {"t": "zeit", "V": "a", "y": "y"}, {}),
 }
 
@@ -752,6 +788,18 @@ def test_a_look_at_a_file_finds_its_columns(tmp_path, name):
     assert not found.lacking
     expected = {"separator": ",", "decimal": ".", "time_unit": "s", "scale": {}, "missing": 0}
     assert {key: getattr(found, key) for key in expected} == expected | more
+
+
+def test_of_columns_with_the_unit_the_most_similar_name_is_taken(tmp_path):
+    """In whatever order they stand; where the unit alone decides, a person is asked to look."""
+    plant = one_state(outputs=["v_out"], inputs={"v_in": "0"}, B=[[1]])
+    system = plant_from_mapping(plant | {"units": {"v_in": "V", "v_out": "V"}})
+    path = tmp_path / "lab.csv"
+    for head in "t,Vin (V),Vout (V)", "t,Vout (V),Vin (V)":
+        path.write_text(f"{head}\n0,1,2\n1,2,3\n")
+        found = guess(str(path), system)
+        assert found.columns == {"t": "t", "v_in": "Vin (V)", "v_out": "Vout (V)"}
+        assert found.reasons["v_in"] == "its unit, as of others: LOOK AT IT"
 
 
 def test_an_output_called_T_is_no_time(tmp_path):
@@ -847,6 +895,9 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     assert guess(str(path), shipped("circuit")).gaps == [-999.0]
 
 
+DAYS = "column time (days) may be in days, t is in s: data.scale.t is the factor between them"
+
+
 @pytest.mark.parametrize(("head", "time", "said"), [
     ("when,v [A],Y", "0", {
         "columns": {"t": "when", "V": "v [A]", "y": "Y"}, "time_unit": "s", "scale": {"V": 1.0},
@@ -860,6 +911,10 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
         "scale": {"y": 1e-3}, "doubts": [],
         "reasons": {"t": "by its name", "time_unit": "from the header", "V": "the same name",
                     "y": "the name is in the header", "scale.y": "mA in the header, A here"},
+    }),
+    ("time (days),V,y", "0", {
+        "time_unit": "s", "scale": {"t": 1.0},
+        "doubts": [DAYS],
     }),
     ("t,V,y,note", "later", {
         "doubts": [f"column t: 'later' is neither a number nor {DATE}", "not read: note"],
@@ -909,6 +964,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     ("m/s", "m", None), ("kg/V", "kg/s", None), ("W", "kW", 1e-3), ("W", "mW", 1e3),
     ("µA", "mA", 1e-3), ("in", "min", None), ("l/min", "m3/s", 1e-3 / 60), ("m3/h", "L/h", 1e3),
     ("°C", "degC", 1.0), ("°C", "K", None), ("cm²", "m2", 1e-4), ("mm", "m3", None),
+    ("mm/s²", "m/s2", 1e-3), ("kg/m3", "g/m3", 1e3), ("cm2/K", "m2/K", 1e-4), ("m2", "k2", None),
     ("rpm", "rad/s", np.pi / 30), ("mbar", "hPa", 1.0), ("kΩ", "ohm", 1e3), ("m", "V", None),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):

@@ -268,7 +268,7 @@ def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:
         return {"name": "csv", **given}
     if data is None or (isinstance(data, str) and data == "none"):
         return data
-    if isinstance(data, list):
+    if isinstance(data, list | tuple) and all(isinstance(f, str | os.PathLike) for f in data):
         return {"name": "csv", "file": [os.fspath(each) for each in data]}
     if not isinstance(data, str | os.PathLike):
         return {"name": "csv", "frame": data}

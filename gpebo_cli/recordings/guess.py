@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from math import isnan, pi
 from operator import ne
 
@@ -34,10 +35,11 @@ _SPELLED = {"°C": "degC", "°": "deg", "Ω": "ohm", "²": "2", "³": "3", "^": 
 _OTHER = {"l": (1e-3, "m3"), "L": (1e-3, "m3"), "bar": (1e5, "Pa"), "deg": (pi / 180.0, "rad"),
           "rpm": (pi / 30.0, "rad/s"), "%": (0.01, "1")}
 _TIMES = ("t", "time", "zeit", "timestamp", "datetime", "date", "datum", "temps", "tiempo")
-_UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "minutes": "min",
-          "h": "h", "hours": "h"}
+_UNITS = {"s": "s", "sec": "s", "seconds": "s", "ms": "ms", "msec": "ms", "milliseconds": "ms",
+          "min": "min", "minutes": "min", "h": "h", "hours": "h"}
 _STEPS = 0.5  # of its rows: an input that changes at so many of them may be one that steps
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
+_BY_UNIT = "its unit"
 _LOOKED_AT = 50  # rows below the header
 _NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have nothing
 
@@ -73,23 +75,27 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
     header, rows = [name.strip() for name in table[0]], table[1:]
     if not rows:
         raise ConfigError(f"{path} has no rows below its header")
-    cells = [[row[k] for row in rows] for k in range(len(header))]
-    commas = re.compile(r"\s*[+-]?\d*,\d+\s*")
+    try:
+        every = list(csv.reader(lines[1:], delimiter=found.separator))
+    except csv.Error as error:
+        raise ConfigError(f"{path} is not CSV: {error}") from None
+
+    def known(k: int) -> Iterator[str]:
+        cells = (row[k].strip() for row in every if k < len(row))
+        return (cell for cell in cells if cell.lower() not in MISSING)
+
+    cells = [list(islice(known(k), _LOOKED_AT)) for k in range(len(header))]
+    commas = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
     if found.separator != "," and any(commas.fullmatch(cell) for row in rows for cell in row):
         found.decimal = ","
         found.reasons["decimal"] = "numbers such as 1,5"
     _find_time(header, cells, (*system.inputs, *system.outputs), found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
-    try:
-        every = list(csv.reader(lines[1:], delimiter=found.separator))
-    except csv.Error as error:
-        raise ConfigError(f"{path} is not CSV: {error}") from None
     for name in system.inputs:
-        k = header.index(found.columns[name]) if name in found.columns else len(header)
-        known = [row[k] for row in every if k < len(row) and row[k].strip().lower() not in MISSING]
-        steps = sum(map(ne, known, known[1:]))
-        if 0 < steps <= _STEPS * len(known):
+        values = list(known(header.index(found.columns[name]))) if name in found.columns else []
+        steps = sum(map(ne, values, values[1:]))
+        if 0 < steps <= _STEPS * len(values):
             found.held.append(name)
     for k in taken:
         _find_gaps([row[k].strip() for row in every if k < len(row)], found)
@@ -128,21 +134,26 @@ def _find_time(
 ) -> None:
     named = [k for k, name in enumerate(header) if _words(name)[:1] and
              _words(name)[0].casefold() in _TIMES and name not in signals]
-    k = named[0] if named else 0
+    # Of a date beside a time of day the one that moves.
+    k = max(named, key=lambda k: len(set(cells[k]))) if named else 0
     found.columns[TIME] = header[k]
     found.reasons[TIME] = "by its name" if named else "the first column"
     numbers = [_number(cell, found.decimal) for cell in cells[k]]
     if any(number is None for number in numbers):
         found.time_unit = "datetime"
-        first = cells[k][0].strip()
+        first = cells[k][0]
         if not isnan(seconds([first], None)[0][0]):
             found.reasons["time_unit"] = f"dates such as {first}"
         else:
             found.doubts.append(f"column {header[k]}: {first!r} is neither a number nor {DATE}")
         return
-    units = [_UNITS[word] for word in _words(header[k])[1:] if word in _UNITS]
+    words = [word.casefold() for word in _words(header[k])[1:]]
+    units = [_UNITS[word] for word in words if word in _UNITS]
     found.time_unit = units[0] if units else "s"
     found.reasons["time_unit"] = "from the header" if units else "not said in the file"
+    written = [word for word in words if _factor(word, "s")] or _units(header[k])
+    if written and not units:
+        _find_scale(TIME, header[k], written[0], "s", found)
 
 
 def _find_gaps(cells: Sequence[str], found: Guess) -> None:
@@ -178,9 +189,9 @@ def _likeness(signal: str, unit: str, name: str) -> tuple[float, str]:
         return 2.5, "the name is in the header"
     if signal in (*re.findall(r"\w+", name), *_words(name)):
         return 2.0, "the name is in the header"
-    if unit and any(_factor(written, unit) is not None for written in _units(name)):
-        return 1.5, "its unit"
     ratio = difflib.SequenceMatcher(None, signal.casefold(), name.casefold()).ratio()
+    if unit and any(_factor(written, unit) is not None for written in _units(name)):
+        return 1.5 + 0.4 * ratio, _BY_UNIT  # of several with that unit the most similar one
     return (ratio, "a similar name") if ratio > 0.6 else (0.0, "")
 
 
@@ -197,9 +208,11 @@ def _find_signals(
         ((_likeness(s, system.units.get(s, ""), header[k]), s, k) for s in signals for k in free),
         key=lambda pair: -pair[0][0],
     )
+    with_unit = Counter(signal for (_, why), signal, _ in pairs if why == _BY_UNIT)
     for (points, why), signal, k in pairs:
         if points > 0 and signal not in found.columns and k in free:
-            found.columns[signal], found.reasons[signal] = header[k], why
+            also = ", as of others: LOOK AT IT" * (why == _BY_UNIT and with_unit[signal] > 1)
+            found.columns[signal], found.reasons[signal] = header[k], why + also
             free.remove(k)
     left = [signal for signal in signals if signal not in found.columns]
     if left and len(left) == len(free):
@@ -212,17 +225,21 @@ def _find_signals(
     for signal, name in found.columns.items():
         unit = system.units.get(signal, "")
         for written in _units(name) if unit else ():
-            factor = _factor(written, unit)
-            if factor is None:
-                found.doubts.append(
-                    f"column {name} may be in {written}, {signal} is in {unit}: "
-                    f"data.scale.{signal} is the factor between them"
-                )
-            if factor != 1.0:
-                found.scale[signal] = factor or 1.0
-                found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here" + (
-                    "" if factor else ": WHICH FACTOR?"
-                )
+            _find_scale(signal, name, written, unit, found)
+
+
+def _find_scale(signal: str, name: str, written: str, unit: str, found: Guess) -> None:
+    factor = _factor(written, unit)
+    if factor is None:
+        found.doubts.append(
+            f"column {name} may be in {written}, {signal} is in {unit}: "
+            f"data.scale.{signal} is the factor between them"
+        )
+    if factor != 1.0:
+        found.scale[signal] = factor or 1.0
+        found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here" + (
+            "" if factor else ": WHICH FACTOR?"
+        )
 
 
 def _units(name: str) -> list[str]:
@@ -244,7 +261,8 @@ def _factor(written: str, unit: str) -> float | None:
     for prefix, base in _prefixed(written):
         for other, same in _prefixed(unit):
             if base == same:
-                power = int(base[-1]) if base[-1] in "23" else 1
+                first = base.partition("/")[0]  # mm/s2 is a thousandth of m/s2
+                power = int(first[-1]) if first[-1] in "23" else 1
                 return (prefix / other) ** power * size / of_unit
     return None
 
@@ -252,7 +270,7 @@ def _factor(written: str, unit: str) -> float | None:
 def _prefixed(unit: str) -> Iterator[tuple[float, str]]:
     """The unit itself, and without the first letter where that may be a prefix."""
     yield 1.0, unit
-    if unit[:1] in _PREFIXES and unit[1:] and unit != "min":
+    if unit[:1] in _PREFIXES and unit[1:2].isalpha() and unit != "min":
         yield _PREFIXES[unit[0]], unit[1:]
 
 

@@ -13,8 +13,10 @@ joined by lines.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpebo_cli.errors import printable
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
@@ -30,6 +32,7 @@ Hold = str | tuple[str, ...]  # of all signals, or of each its own
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
 _FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
+_FASTEST = 8.0  # of a mode, per element, that decides how many nodes one has
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
 _SMALLEST = 1e-9  # an edge nearer than this share of a step to a sample is that sample
 
@@ -178,8 +181,8 @@ def _merged(signal: Held, knots: Array, rule: RadauRule, tol: float) -> Array:
 def _parts(source: CoefficientSource, signal: Held, mesh: Mesh, tol: float) -> float:
     """Into how many parts elements will be cut, as far as a few of them tell.
 
-    What has to be resolved are the plant's matrices, and products of two held signals, because
-    the observer makes products of everything with everything.
+    What has to be resolved are the plant's matrices, and products of two held signals and of two
+    solutions, because the observer makes products of everything with everything.
     """
     chosen = np.unique(np.linspace(0, mesh.size - 1, _PROBED).round().astype(np.intp))
     left, step = mesh.edges[chosen, None], mesh.steps[chosen, None]
@@ -189,7 +192,23 @@ def _parts(source: CoefficientSource, signal: Held, mesh: Mesh, tol: float) -> f
     c = source.taylor(t.ravel(), 1, inside.ravel(), samples[None] if source.signals else None)
     matrices = (c.A, c.B, c.F, c.C, c.phi, c.D, c.H)
     kinds = (c.E[0], c.E[1], *(matrix[0] for matrix in matrices), samples, samples**2)
-    values = np.concatenate([kind.reshape(*t.shape, -1) for kind in kinds], axis=2)
+    longest = int(step.argmax())
+    E, A = (matrix[0, longest * t.shape[1]] for matrix in (c.E, c.A))
+    modes = np.exp(2.0 * mesh.rule.points[:, None] * _rates(E, step[longest] * A))
+    of_plant = np.broadcast_to(np.hstack([modes.real, modes.imag]), (*t.shape, 2 * modes.shape[1]))
+    values = np.concatenate([*(kind.reshape(*t.shape, -1) for kind in kinds), of_plant], axis=2)
     scale = signal_scale(values)
     tail = float((legendre_tail(values, mesh.rule, scale) / scale).max(initial=0.0))
     return max(1.0, float((tail / tol) ** (1.0 / (mesh.rule.stages + 1))))
+
+
+def _rates(E: Array, A: Array) -> NDArray[np.complex128]:
+    """Finite eigenvalues of a pencil, by those of (E − A)⁻¹E = 1/(1 − λ), if that is regular.
+
+    Without those of modes so fast that they are gone within part of an element.
+    """
+    if len(E) <= _PROBED:  # beyond it takes seconds
+        with suppress(np.linalg.LinAlgError):
+            kept = np.linalg.eigvals(np.linalg.solve(E - A, E)).astype(complex)
+            return np.asarray(1.0 - 1.0 / kept[np.abs(kept) > 1.0 / _FASTEST])
+    return np.zeros(0, dtype=complex)

@@ -97,7 +97,8 @@ def read_table(data: DataSettings, system: DescriptorSystem) -> Table:
 
         if not isinstance(data.frame, pd.DataFrame):
             raise ConfigError(
-                f"data: expected a file or a pandas.DataFrame, got {shown(data.frame)}"
+                "data: expected a file, a list of files or one pandas.DataFrame, got "
+                f"{shown(data.frame)}"
             )
         return _from_frame("data", _indexed(data.frame, time), data, system, "")
     if not data.file:
@@ -312,7 +313,7 @@ def seconds(cells: Sequence[str], origin: Any) -> tuple[Array, Any]:
 
     points = [point.replace(",", ".") for point in points]  # ISO 8601 has both, pandas only this
     times = pd.to_datetime(points, format="ISO8601", utc=True, errors="coerce")
-    origin = times[0] if origin is None else origin
+    origin = times.min() if origin is None else origin  # the first may be no time
     return np.asarray((times - origin).total_seconds(), dtype=np.float64), origin
 
 
@@ -470,7 +471,7 @@ def _from_frame(
         column, of_time = frame.iloc[:, k], k == header.positions[0]
         kind = column.dtype.kind
         if kind in "mM":
-            column = column - column.iloc[0] if kind == "M" else column
+            column = column - column.min() if kind == "M" else column  # the first may be no time
             values = column.dt.total_seconds().to_numpy(dtype=np.float64)
         elif kind in "iuf":
             values = column.to_numpy(dtype=np.float64, na_value=np.nan)
