@@ -15,8 +15,9 @@ from scipy.linalg import expm
 from gpebo_cli import run
 from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
+from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.metrics import settling_times
-from gpebo_cli.evidence.uncertainty import _maps, deviations, noise_level
+from gpebo_cli.evidence.uncertainty import deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.experiment.result import Fit
@@ -619,7 +620,7 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
     A, B = np.array([[-a, 0.0], [gain * c, -gain]]), np.array([[1.0], [0.0]])
     mesh = Mesh(np.array([0.0, h]), radau_rule(4))
     A, B = (np.broadcast_to(each, (1, 4, *each.shape)) for each in (A, B))
-    (f, s), decayed = _maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
+    (f, s), decayed = error_maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
     np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
 
@@ -628,7 +629,7 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
 @pytest.mark.parametrize("widths", [[6], [2, 1, 1, 1, 2], [1] * 4, [1, 3, 1, 1], [0]])
 def test_elements_solved_block_by_block_are_those_of_the_whole_system(widths, apart, monkeypatch):
     """exp of the system beside its errors; rows of width 1 that follow each other are apart."""
-    monkeypatch.setattr(uncertainty, "_SMALL", 0)
+    monkeypatch.setattr("gpebo_cli.evidence.error_maps._SMALL", 0)
     rng, d = np.random.default_rng(len(widths)), sum(widths)
     A, ends = rng.normal(size=(d, d)), np.cumsum(widths)
     for first, width in zip(ends - widths, widths, strict=True):
@@ -636,7 +637,7 @@ def test_elements_solved_block_by_block_are_those_of_the_whole_system(widths, ap
     singles = np.repeat(widths, widths) == 1
     A[apart & np.outer(singles, singles) & ~np.eye(d, dtype=bool)] = 0.0
     B, mesh = rng.normal(size=(d, 2)), Mesh(np.array([0.0, 0.1, 0.3]), radau_rule(6))
-    found = _maps(mesh, mesh.steps, *(np.broadcast_to(x, (2, 6, *x.shape)) for x in (A, B)))
+    found = error_maps(mesh, mesh.steps, *(np.broadcast_to(x, (2, 6, *x.shape)) for x in (A, B)))
     whole = np.zeros((d + 2, d + 2))
     whole[:d] = np.hstack([A, B])
     for element in range(2):

@@ -13,13 +13,12 @@ orthogonal transformations: no variance can become negative, whatever the roundi
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 
 import numpy as np
 
+from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.groups import Groups, grouped
 from gpebo_cli.evidence.knowledge import Knowledge
-from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.expressions import among
 from gpebo_cli.numerics.linalg import reciprocals, transpose, triangular
@@ -27,10 +26,9 @@ from gpebo_cli.numerics.mesh import Mesh, Sampler
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import wanted_parts
 from gpebo_cli.numerics.rows import Rows
-from gpebo_cli.regression.errors import ErrorRecursion, ErrorsAt, ErrorSteps, ErrorSystem
+from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Reset
-from gpebo_cli.regression.samples import SampledRegression, integrating
 
 _STAGES = 5  # order 9: a deviation needs three digits, and elements end at the samples
 _TOLERANCE = 1e-3  # of a deviation, in the last coefficient of an element: more is cut,
@@ -45,15 +43,13 @@ _FASTEST = 0.1 / float(np.finfo(float).eps)  # rates times the horizon: their ro
 _SNAP = 1e-6  # of a row
 _CHUNK = 1 << 22  # numbers in the systems that are solved at once
 _TIMES = 2001  # at which the size of the errors of Y is looked at
-_LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
+LEFT = 1e-3  # share of the noise in Y that a fit has to leave before its level is estimated
 _AGREE = 0.01  # of a deviation, if groups of half the size make it: the rest is a third of that
 _GROUPS = 2000  # of samples, by which many of them are replaced at first
 _PER_ELAPSED = 64  # groups at least, since the start, at first
-_BESIDE = 8  # errors that stand beside each other in a factor
+BESIDE = 8  # errors that stand beside each other in a factor
 _ROWS = 1 << 15  # that are looked at at once
-_STIFF = 1e6  # rates times steps, from which on rows count alike
-_SMALL = 15  # errors, up to which one system costs less than its blocks
-_SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
+SINGULAR = 1e-12  # share of the largest eigenvalue of G below which a direction is not fitted
 
 
 def deviations(
@@ -197,7 +193,7 @@ class _Chain:
             group = _group_of(mesh, self._groups.starts)
             weights = self._groups.weights(mesh.points[new, 1:], group[new, None], self._until)
             B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
-            made = _maps(mesh, mesh.steps[new], joint.A, B)
+            made = error_maps(mesh, mesh.steps[new], joint.A, B)
             (count, stages), C = made.shape[:2], joint.C
             C = C if len(C) > 1 else C.repeat(count * stages, axis=0)
             if not cuts:
@@ -361,7 +357,7 @@ def noise_level(
             .reshape(-1, p + 1) for t in np.array_split(own, 1 + len(own) // _ROWS)
         )
     _, sigma, Vt = np.linalg.svd(root[:, :p], full_matrices=False)
-    known = sigma > np.sqrt(_SINGULAR) * sigma.max(initial=0.0)
+    known = sigma > np.sqrt(SINGULAR) * sigma.max(initial=0.0)
     inverse = reciprocals(sigma, known)[:, None] * Vt
 
     def of_Y(t: Array, inside: Array) -> ErrorSystem:
@@ -388,7 +384,7 @@ def noise_level(
     eta = inverse.T @ (inverse @ (root[:, :p].T @ root[:, p]))
     square = float(((root @ np.append(-eta, 1.0)) ** 2).sum())
     more = len(own) * np.count_nonzero(outputs) > known.sum()  # numbers than estimates
-    return float(np.sqrt(square / left)) if more and left > _LEFT * whole else np.nan
+    return float(np.sqrt(square / left)) if more and left > LEFT * whole else np.nan
 
 
 def _mesh(edges: Array, groups: Groups, starts: Array) -> Mesh:
@@ -434,109 +430,6 @@ def _group_of(mesh: Mesh, instants: Array) -> IntArray:
     return np.asarray(np.searchsorted(instants, middle, side="right").clip(1) - 1)
 
 
-def _maps(mesh: Mesh, steps: Array, A: Array, B: Array) -> Array:
-    """z at each node from that at the left end and from e, z' = A z + B e; (K, s, d, d + c).
-
-    A (K, s, d, d) and B (K, s, d, c) are at the nodes of elements with these ``steps`` (K,). Errors
-    go from ζ to filters and from there to the law: a large A is solved by its triangle of blocks.
-    """
-    d, c = B.shape[2:]
-    size = 1.0 + steps[:, None] * np.abs(A).max(axis=(1, 3), initial=0.0)
-    # Beside the rows of a law with a large gain those of its filters would be rounding.
-    weights = 1.0 / size[:, None, :, None] if size.max(initial=0.0) > _STIFF else None
-    if 0 < d <= _SMALL:
-        return np.concatenate(_solved(mesh, steps, weights, A, B, 1), axis=3)
-    out = np.zeros((*B.shape[:3], c + d))  # from e first
-    for first, count, width in _blocks((A != 0.0).any(axis=(0, 1))):
-        part = slice(first, first + count * width)
-        f = A[:, :, part, :first] @ out[:, :, :first, : c + first]
-        f[..., :c] += B[:, :, part]
-        within, own = slice(c + part.start, c + part.stop), A[:, :, part, part]
-        out[:, :, part, within], out[:, :, part, : c + first] = _solved(
-            mesh, steps, weights if weights is None else weights[:, :, part], own, f, count
-        )
-    return np.concatenate([out[..., c:], out[..., :c]], axis=3)
-
-
-def _solved(
-    mesh: Mesh, steps: Array, weights: Array | None, A: Array, f: Array, count: int
-) -> tuple[Array, Array]:
-    """z at each node from that at the left end (K, s, m, m), and from zero (K, s, m, c).
-
-    z' = A z + f, its rows multiplied by ``weights`` (K, 1, m, 1), None: 1. A (K, s, m, m) consists
-    of ``count`` diagonal blocks.
-    """
-    K, s, m, c = f.shape
-    width, own, E = m // count, np.zeros(A.shape), None
-    if weights is not None:
-        A, f = weights * A, weights * f
-        E = (weights.reshape(-1, 1, width, 1) * np.eye(width)).repeat(1 + s, axis=1)
-        E = E.reshape(-1, width, width)
-    by_block = K, s, count, width, count, width
-    apart = np.einsum("ksgvgw->kgsvw", A.reshape(by_block))
-    given = f.reshape(*by_block[:4], c).swapaxes(1, 2)
-    # At the left ends nothing is looked at.
-    apart, given = (
-        np.concatenate([x[:, :, :1], x], axis=2).reshape(-1, *x.shape[3:]) for x in (apart, given)
-    )
-    homogeneous, particular = elements.element_maps(
-        mesh.rule.differentiation, steps.repeat(count), E, apart, given, None, None,
-        np.arange(K * count), K * count,
-    )
-    np.einsum("ksgvgw->kgsvw", own.reshape(by_block))[...] = homogeneous.reshape(
-        K, count, s, width, width
-    )
-    return own, particular.reshape(K, count, s, width, c).swapaxes(1, 2).reshape(f.shape)
-
-
-def _blocks(reaches: BoolArray) -> list[tuple[int, int, int]]:
-    """Where the diagonal blocks of a triangular matrix begin, how many stand there, how wide.
-
-    What ``reaches`` (d, d) a row is true in it. Rows that do not reach each other are blocks of
-    width 1.
-    """
-    d = len(reaches)
-    last = np.maximum.accumulate(np.where(reaches, np.arange(d), 0).max(axis=1, initial=0))
-    ends = np.flatnonzero(last <= np.arange(d)) + 1
-    found: list[tuple[int, int, int]] = []
-    for first, end in pairwise([0, *ends.tolist()]):
-        if found and end == first + 1 and found[-1][2] == 1:
-            begun, groups, _ = found[-1]
-            if not reaches[first, begun:first].any():
-                found[-1] = begun, groups + 1, 1
-                continue
-        found.append((first, 1, end - first))
-    return found
-
-
-def error_steps(mesh: Mesh, times: Array, lines: BoolArray, A: Array, B: Array) -> Array:
-    """ζ at each time but the first from that before and from the errors e at both, (K, k, k + 2 c).
-
-    Of elements between the times (K + 1,) of samples; between them e is linear where ``lines``
-    (c,), else held. Of ζ' = A ζ + B e, A (elements or 1, s + 1 or 1, k, k) and B (…, k, c) are at
-    the points of the mesh.
-    """
-    points = mesh.points[:, 1:]
-    after = np.searchsorted(times, mesh.edges[1:] - 0.5 * mesh.steps)  # whose step it is part of
-    # Of the newer of both errors.
-    share = (points - times[after - 1, None]) / (times[after] - times[after - 1])[:, None]
-    A, B = (
-        np.broadcast_to(each[:, -mesh.rule.stages :], (*points.shape, *each.shape[2:]))
-        for each in (A, B)
-    )
-    share = share[..., None, None] * lines
-    ends = _maps(mesh, mesh.steps, A, np.concatenate([(1.0 - share) * B, share * B], axis=3))[:, -1]
-    if len(ends) == len(times) - 1:
-        return ends
-    k = ends.shape[1]
-    out = np.zeros((len(times) - 1, *ends.shape[1:]))
-    out[:, :, :k] = np.eye(k)
-    for end, step in zip(ends, after - 1, strict=True):
-        out[step] = end[:, :k] @ out[step]
-        out[step, :, k:] += end[:, k:]
-    return out
-
-
 def _factors(
     ends: Array, fresh: BoolArray, anew: BoolArray, deviations: Array, memory: Array,
     L: Array | None, turns: Mapping[int, Array],
@@ -551,7 +444,7 @@ def _factors(
     """
     size, (alive, signals) = ends.shape[1], deviations.shape[1:]
     own, whole = np.arange(signals), size + alive * signals
-    width = whole + _BESIDE * signals
+    width = whole + BESIDE * signals
     L = np.zeros((whole, whole)) if L is None else L
     used = L.shape[1]
     L = np.pad(L, ((0, 0), (0, width - used)))
@@ -575,123 +468,3 @@ def _factors(
         out[k] = L
         L[:size] = end @ L
     return out, L
-
-
-class SampledDeviations:
-    """One standard deviation from one sample to the next; it remembers L and no past."""
-
-    def __init__(
-        self, variances: Array, number: Callable[[Array], Array] | None, *, relative: bool
-    ) -> None:
-        """Prepare for the first sample.
-
-        With variances of each sample of [u; y], (m + r,), and the ``number`` of the sample whose
-        errors times (K,) have; None: each its own. If ``relative``, what :meth:`update` finds is a
-        factor.
-        """
-        self._deviations, self._number, self._relative = np.sqrt(variances), number, relative
-        self.noisy = variances > 0.0  # (m + r,)
-        self._factors: list[tuple[Array, int]] = []  # L of [ζ; e; s] of each case, how wide
-        self._before: tuple[Array, Array] | None = None  # C and D of the last sample
-        self._last = -np.inf
-        self._expected, self._square = 0.0, 0.0  # E∫|δY|² so far, E|δY|² at the last sample
-
-    def update(
-        self, observer: ErrorSteps, cases: Sequence[ErrorRecursion],
-        regression: SampledRegression, gain: Array, roots: Array,
-    ) -> tuple[Array, Array]:
-        """Deviations of η̂ and x̂ of every case at K samples (G, K, p + n), and their factor (K,).
-
-        ``observer`` takes errors of [u; y] to those of Y and of the state's offset, ``cases`` those
-        of Y to those of η̂. The gain of x = offset + gain η is (K, n, p), or of each case its own,
-        (G, K, n, p), and ``roots`` are S of all data so far, without forgetting, (K, p + 1, p + 1).
-        """
-        count, n, p = gain.shape[-3:]
-        gains = np.broadcast_to(gain, (len(cases), count, n, p))
-        k, rows, signals = observer.step.shape[1], observer.C.shape[1] - n, len(self._deviations)
-        C, D = observer.C, observer.D
-        before = (C[:1], D[:1]) if self._before is None else self._before
-        self._before = C[-1:], D[-1:]
-        C_old, D_old = (
-            np.concatenate([old, new[:-1]])[:, :rows]
-            for old, new in zip(before, (C, D), strict=True)
-        )
-        number = regression.t if self._number is None else self._number(regression.t)
-        fresh = np.diff(number, prepend=self._last) > 0
-        self._last = float(number[-1])
-        Y_new = C[:, :rows] @ observer.step  # δY' of [ζ; e; e'], but for D e'
-        Y_new[:, :, k + signals :] += D[:, :rows]
-        Y_old = np.concatenate([C_old, D_old, np.zeros((count, rows, signals))], axis=2)
-        if self._relative:  # with h as of least squares
-            plain = integrating(regression)
-            cases = [_beside(ErrorRecursion(*plain, plain.A), cases[0]), *cases[1:]]
-        out = np.empty((len(cases), count, p + n))
-        for g, case in enumerate(cases):
-            size = k + signals + case.A.shape[1]
-            M = np.zeros((count, size, size + signals))
-            both = np.r_[: k + signals, size : size + signals]  # ζ and the errors of two samples
-            M[:, :k, both] = observer.step
-            M[:, k : k + signals, size:] = np.eye(signals)
-            M[:, k + signals :, both] = case.old @ Y_old + case.new @ Y_new
-            M[:, k + signals :, k + signals : size] = case.A
-            if len(self._factors) <= g:
-                self._factors.append((np.zeros((size, size)), size))
-            L = self._recursion(g, M, fresh, slice(k, k + signals))
-            eta = case.C @ L[:, k + signals :]
-            own = eta[:, -p:]
-            x = gains[g] @ own + C[:, rows:] @ L[:, :k] + D[:, rows:] @ L[:, k : k + signals]
-            out[g] = np.linalg.norm(np.concatenate([own, x], axis=1), axis=2)
-            if g == 0 and self._relative:
-                of_Y = C[:, :rows] @ L[:, :k] + D[:, :rows] @ L[:, k : k + signals]
-                level = self._level(regression, (of_Y**2).sum(axis=(1, 2)), eta[:, :p], roots)
-        return out, level if self._relative else np.ones(count)
-
-    def _recursion(self, g: int, M: Array, fresh: BoolArray, errors: slice) -> Array:
-        """L of one case at the samples, (K, d, ·), from [z; e'] to z' (K, d, d + signals).
-
-        The errors of several samples stand side by side, before it is made triangular again.
-        """
-        size, signals = M.shape[1], len(self._deviations)
-        A, new = M[:, :, :size], M[:, :, size:]
-        A[~fresh, :, errors] += new[~fresh]  # the errors are those of the sample before
-        new = new * self._deviations
-        out = np.zeros((len(M), size, size + _BESIDE * signals))
-        L, used = self._factors[g]
-        for k, own in enumerate(fresh.tolist()):
-            if own and used == out.shape[2]:
-                L, used = np.asarray(np.linalg.qr(L.T, mode="r")).T, size
-            np.matmul(A[k], L[:, :used], out=out[k, :, :used])
-            if own:
-                out[k, :, used : used + signals] = new[k]
-                used += signals
-            L = out[k]
-        self._factors[g] = L.copy(), used
-        return out
-
-    def _level(
-        self, regression: SampledRegression, of_Y: Array, of_h: Array, roots: Array
-    ) -> Array:
-        """σ (K,) from the residual so far, see :func:`noise_level`; NaN where nothing is left."""
-        old, new = regression.shares
-        before = np.append(self._square, of_Y[:-1])
-        expected = self._expected + np.cumsum(old * before + new * of_Y)
-        self._expected, self._square = float(expected[-1]), float(of_Y[-1])
-        _, sigma, Vt = np.linalg.svd(roots[:, :-1, :-1])
-        known = sigma**2 > _SINGULAR * sigma[:, :1] ** 2
-        fitted = reciprocals(sigma, known)[..., None] * (Vt @ of_h)
-        left = expected - (fitted**2).sum(axis=(1, 2))
-        left[left <= _LEFT * expected] = np.nan
-        return np.asarray(np.abs(roots[:, -1, -1]) / np.sqrt(left))
-
-
-def _beside(a: ErrorRecursion, b: ErrorRecursion) -> ErrorRecursion:
-    """Two systems of the same errors of Y as one, one above the other."""
-    def diagonal(x: Array, y: Array) -> Array:
-        out = np.zeros((len(x), x.shape[1] + y.shape[1], x.shape[2] + y.shape[2]))
-        out[:, : x.shape[1], : x.shape[2]], out[:, x.shape[1] :, x.shape[2] :] = x, y
-        return out
-
-    return ErrorRecursion(
-        diagonal(a.A, b.A), np.concatenate([a.old, b.old], axis=1),
-        np.concatenate([a.new, b.new], axis=1), diagonal(a.C, b.C),
-    )

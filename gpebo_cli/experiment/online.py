@@ -15,7 +15,7 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.estimators import InformationRoot
 from gpebo_cli.evidence.excitation import WELL, Excitation
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
-from gpebo_cli.evidence.uncertainty import SampledDeviations
+from gpebo_cli.evidence.sampled_uncertainty import SampledDeviations
 from gpebo_cli.experiment import doubts as doubted
 from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES

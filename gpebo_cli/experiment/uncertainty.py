@@ -6,7 +6,8 @@ import numpy as np
 
 from gpebo_cli.estimators import ResumableEstimator
 from gpebo_cli.estimators import errors as behind
-from gpebo_cli.evidence.uncertainty import SampledDeviations, deviations, noise_level
+from gpebo_cli.evidence.sampled_uncertainty import SampledDeviations
+from gpebo_cli.evidence.uncertainty import deviations, noise_level
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, IntArray

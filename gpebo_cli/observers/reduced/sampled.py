@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.evidence.uncertainty import error_steps
+from gpebo_cli.evidence.error_maps import error_steps
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.collocation import LinearSolution, solve
