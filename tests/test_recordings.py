@@ -1008,6 +1008,13 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+@pytest.mark.parametrize("time", [{"start": 1.96}, {"start": 0.0, "horizon": 0.03}])
+def test_a_span_with_one_row_has_no_residual_to_look_at(time):
+    t = np.linspace(0.0, 2.0, 21)
+    result = run(one_state(), data={"t": t, "y": np.exp(-t)}, time=time)
+    assert result.details.fit.white is None
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])
