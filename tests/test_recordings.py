@@ -1008,6 +1008,30 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+def test_many_files_are_estimated_as_well_as_one(tmp_path):
+    """What ls_drem learns is learnt once the last one has begun, as if it were the first."""
+    files = [
+        written(tmp_path, f"{k}.csv", 0, f"1 + sin({k + 1}*t)", k, rows=41, noise=0.02, seed=k)
+        for k in range(4)
+    ]
+    (eta, sigma), (least, least_sigma) = (
+        (found.parameters[0, -1], found.parameters_std[0, -1])
+        for found in (
+            run(LEAKY, data=files, estimator=name, time={"samples": 5}, **more).details.estimation
+            for name, more in (("ls_drem", {}), ("least_squares", {"f0": None}))
+        )
+    )
+    np.testing.assert_array_less(np.abs(eta - least), 0.5 * least_sigma)
+    np.testing.assert_allclose(sigma, least_sigma, rtol=0.2)
+
+
+@pytest.mark.parametrize("time", [{"start": 1.96}, {"start": 0.0, "horizon": 0.03}])
+def test_a_span_with_one_row_has_no_residual_to_look_at(time):
+    t = np.linspace(0.0, 2.0, 21)
+    result = run(one_state(), data={"t": t, "y": np.exp(-t)}, time=time)
+    assert result.details.fit.white is None
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])

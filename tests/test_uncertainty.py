@@ -326,6 +326,11 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
     ({"follows": True, "in_matrices": ("y", "z")}, (
         f": the residual{NOT}0.00, and it follows the inputs), which noise of y, z in the matrices "
         f"does (observer.remedy=noise_free takes it out); or it suggests {WHY}")),
+    ({"slow": True, "of_inputs": ("u",)}, (f": the residual{NOT}0.00, and a part of it is slow), "
+                                           f"which noise of u does; or it suggests {WHY}")),
+    ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
+        f": the residual, 1.00{TIMES}, is not white, that of least squares of the same data is: "
+        "what is left says more of these estimates than of the model")),
     ({"slow": True, "rounded": [("y", 0.05)]}, (
         f": the residual{NOT}0.00, and a part of it is slow), which suggests that it is rounding "
         f"(y to steps of 0.05), for which deviations are too small, or {WHY}")),
@@ -337,6 +342,19 @@ def test_what_a_residual_says_of_the_model(fit, said):
     """Of five correlations one may be beyond the band of 0.2."""
     made = {"residual": [0.05], "size": 1.0, "least": 0.05, "correlation": NOTHING, "band": 0.2}
     assert _explains(Fit(**made | fit), 0) == said
+
+
+def test_what_the_residual_of_a_right_plant_is_coloured_by_is_said():
+    """Estimates that forget most of the data, and an input that is measured with noise."""
+    plant = one_state(A=[[-1]], B=[[1]], inputs={"u": "sin(t)"}, unknowns={"k": 1.0}, F=[[1]])
+    made = run(plant, observer="none", time={"horizon": 40, "samples": 401})
+    noise = np.random.default_rng(2).standard_normal((2, 401))
+    right = {"t": made.t, "u": made["u"], "y": made["y"] + 0.05 * noise[0]}
+    said = run(plant, data=right, estimator="ls_drem", beta=1.0).verdict
+    assert "the residual is not white, that of least squares of the same data is:" in said
+    levels = {"name": "gaussian", "outputs": 0.05, "inputs": 1.0}
+    seen = right | {"u": made["u"] + noise[1]}
+    assert "which noise of u does; or it suggests" in run(plant, data=seen, noise=levels).verdict
 
 
 def test_at_samples_matrices_may_follow_an_input_without_noise():

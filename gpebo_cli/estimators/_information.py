@@ -52,6 +52,7 @@ class Information:
     memory: Trajectory  # z, scalar
     level: Array  # (p,) diagonal of ∫ψᵀψ over this regression alone, or more
     began: float  # when data were first gathered
+    since: float  # when all of them had begun to be
     # Units of parameters in which rounding of G_z is 1, by times (M,), its diagonal, and how wrong
     # rounding may make that (M, p); None: an f₀ says what is known at the start.
     units: Callable[[Array, Array, Array], Array] | None = None
@@ -64,15 +65,16 @@ class Information:
 
     @cached_property
     def told(self) -> float:
-        """When rounding no longer decides what G_z⁻¹h_z is, in seconds since ``began``, or ∞."""
+        """When rounding no longer decides what G_z⁻¹h_z is, in seconds since ``since``, or ∞."""
         if self.units is None:
             return 0.0
         start, end = self.gram.mesh.edges[[0, -1]].tolist()
+        start = min(max(start, self.since), end)
         t = np.append(start, start + (end - start) * _LOOKED)
         known = self.at(t).spectrum.digits > SINGULAR
         if not known.any():
             return np.inf
-        return float(t[known.argmax()]) - self.began if not known[0] else 0.0
+        return float(t[known.argmax()]) - self.since if not known[0] else 0.0
 
     def at(self, t: Array, inside: Array | None = None) -> InformationAt:
         """G_z, h_z and z at the times t (M,)."""
@@ -300,7 +302,8 @@ def information(
         return prior_units(energy, regression.terms(t), t - began, rounding)
 
     def made(gram: Trajectory, memory: Trajectory) -> Information:
-        return Information(gram, memory, level, began, units if f0 is None else None)
+        since = max(began, regression.since)
+        return Information(gram, memory, level, began, since, units if f0 is None else None)
 
     if beta == 0.0:
         gram = regression.gram

@@ -89,8 +89,8 @@ class LsDrem(ResumableEstimator):
             here, into = info.at(t, inside), transpose(regression.psi(t, inside))
             rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], part.covariance_bound)
             if self.gamma is None:
-                gain = gain * one_over_memory(t, case["beta"], info.began)[:, None]
-            elapsed = t - info.began
+                gain = gain * one_over_memory(t, case["beta"], info.since)[:, None]
+            elapsed = t - info.since
             followed = elapsed >= _WITHOUT * info.told
             delta, adjugate, digits = here.mixing(case["alpha"], f0_of(case), followed)
             rates = np.broadcast_to(rate[:, None], adjugate.shape[:2])
@@ -119,7 +119,7 @@ class LsDrem(ResumableEstimator):
         groups = tuple(
             mix_least_squares(
                 info, case["alpha"], f0_of(case), t, regression.floor,
-                partial(one_over_memory, beta=case["beta"], began=info.began)
+                partial(one_over_memory, beta=case["beta"], began=info.since)
                 if self.gamma is None else None,
             )
             for info, case in zip(infos, part.cases, strict=True)
@@ -132,7 +132,8 @@ class LsDrem(ResumableEstimator):
 def one_over_memory(t: Array, beta: float, began: float = 0.0) -> Array:
     """1/∫ e^{−β(t−s)} ds at the times t (N,), from when data were first gathered, in 1/s."""
     elapsed = np.maximum(t - began, _NO_TIME)
-    return np.asarray(beta / -np.expm1(-beta * elapsed) if beta else 1.0 / elapsed)
+    pace = beta / -np.expm1(-beta * elapsed) if beta else 1.0 / elapsed
+    return np.where(t < began, 0.0, pace)
 
 
 def _mixed(

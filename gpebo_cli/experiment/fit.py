@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -41,11 +42,18 @@ def fit_of(
         return float(np.sqrt(regression.misfit(eta) / duration))
 
     changing = bool(regression.resets) or regression.dynamics is not None
-    least = np.nan if changing else rms(regression.least_squares())
-    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)), least)
+    residual, size = np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p))
     if changing:
-        return fit
-    return _explained(fit, final[fit.best], about, system, source)
+        return Fit(residual, size, np.nan)
+    best = regression.least_squares()
+    fit = Fit(residual, size, rms(best))
+    found = _explained(fit, final[fit.best], about, system, source)
+    worse = residual[fit.best] > (1.0 + _SILENT) * fit.least
+    if not worse or (found.white is not False and not found.far):
+        return found
+    # Estimates that forget are farther from the truth than the noise of all data brings them.
+    of_least = _explained(fit, best, about, system, source)
+    return replace(found, least_white=bool(of_least.white and not of_least.far))
 
 
 def _varies_slowly(residual: Array) -> bool:
@@ -127,6 +135,8 @@ def _explained(
     fit = replace(fit, outputs=fitted)
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
+    if len(samples) < 2:
+        return fit
     if observation.regression.factor is None and not source.pieces:
         u, y = source.inputs(samples), source.outputs(samples)
         t, fitted = samples, outputs(samples, samples, u, y)
@@ -163,5 +173,6 @@ def _explained(
         in_matrices=() if observation.errors is not None else tuple(
             name for name in system.outputs if name in system.followed
         ),
+        of_inputs=tuple(compress(system.inputs, source.levels.noisy_inputs)),
         band=1.96 / np.sqrt(count * seen.sum()),
     )

@@ -128,6 +128,7 @@ def joined_observation(
                 np.column_stack([wide(factor[:, :-1], k), factor[:, -1]])
                 for k, factor in enumerate(factors)
             ]) if len(factors) == len(regressions) else None,
+            since=float(starts[-1]),
         ),
         state_map=AffineStateMap(
             _joined([each.offset for each in affine], shifts),

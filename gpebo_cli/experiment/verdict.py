@@ -27,6 +27,7 @@ _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
+_OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
@@ -84,10 +85,7 @@ def _explains(fit: Fit, case: int) -> str:
     """What the residual says of the model."""
     residual = fit.residual[case]
     if residual > WORSE * fit.least and residual > _EXACT * fit.size:
-        return (
-            f", where least squares of the same data leave {fit.least:.2g}: what is left says "
-            "more of these estimates than of the model"
-        )
+        return f", where least squares of the same data leave {fit.least:.2g}: {_OF_ESTIMATES}"
     noise, why = "", "a missing or wrong parameter, a drifting sensor, or a delay"
     if fit.ratio is not None:
         noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
@@ -97,6 +95,9 @@ def _explains(fit: Fit, case: int) -> str:
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
     if residual <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    if fit.least_white:
+        of_least = "that of least squares of the same data is"
+        return f": the residual{noise and noise + ','} is not white, {of_least}: {_OF_ESTIMATES}"
     if fit.far:
         told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
         rest = "" if fit.white else (
@@ -113,7 +114,9 @@ def _explains(fit: Fit, case: int) -> str:
         return f": the estimates explain the data up to white noise{noise}"
     if fit.white:
         return f": the residual is white{noise}, which suggests a noisier sensor than was said"
-    names = ", ".join(fit.in_matrices)
+    made = " or ".join(f"noise of {', '.join(names)} {does}" for names, does in (
+        (fit.in_matrices, f"in the matrices does ({_TAKEN_OUT})"), (fit.of_inputs, "does"),
+    ) if names)
     if fit.rounded:
         steps = ", ".join(f"{name} to steps of {step:.2g}" for name, step in fit.rounded)
         why = f"that it is rounding ({steps}), for which deviations are too small, or {why}"
@@ -121,8 +124,7 @@ def _explains(fit: Fit, case: int) -> str:
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}"
         f"{', and it follows the inputs' * fit.follows}), which "
-        f"{f'noise of {names} in the matrices does ({_TAKEN_OUT}); or it ' if names else ''}"
-        f"suggests {why}"
+        f"{made}{'; or it ' * bool(made)}suggests {why}"
     )
 
 

@@ -50,6 +50,7 @@ class LinearRegression:
     # Where Y is the projection of what was measured, |factor [−η; 1]|² is ∫‖Y − ψη‖² of that.
     factor: Array | None = None  # (k, p + 1)
     whole: LinearRegression | None = None  # a long one, of which this is a window
+    since: float = -np.inf  # when the last of several experiments begins: before not all is seen
 
     @classmethod
     def from_functions(
