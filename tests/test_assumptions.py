@@ -138,6 +138,9 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert names["Growth of Φ"].evidence["rate"] == pytest.approx(1.0, rel=1e-9)
     assert not names["Growth of Φ"].holds
     assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
+    (warning,) = run(one_state(A=[[1]]), observer={"form": "given"}).details.warnings
+    assert "of observer=gpebo in continuous time is needed" in warning
+    assert "strangeness_free" not in warning, "no output is fed back where E is regular"
     falls = plant_from_mapping(one_state(A=[[-1]]))
     equal = found(plant_from_mapping(one_state(
         states=["a", "b", "c"], E=np.diag([1, 1, 0]).tolist(), C=[[1, 0, 0]],

@@ -358,6 +358,19 @@ def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differen
         strangeness_free(given, t, t, signals, max_mu=3, rank_tol=1e-10)
 
 
+def test_an_algebraic_state_in_no_row_but_its_outputs_needs_the_form_as_given():
+    """Titration: what is measured follows from a nonlinear row, in which only its output stands."""
+    plant = {
+        "name": "p", "states": ["x", "s"], "outputs": ["y"], "unknowns": {"feed": 0.5},
+        "E": [[1, 0], [0, 0]], "A": [[-1, 0], [1, 0]], "F": [[1], [0]], "phi": [0, "-y - y**3"],
+        "C": [[0, 1]], "initial_state": [2, 1],
+    }
+    with pytest.raises(ModelError, match=r"strangeness_free takes y as known, .*form=given takes"):
+        run(plant, observer={"form": "strangeness_free"}, time={"horizon": 2.0})
+    result = run(plant, observer={"form": "given"}, time={"horizon": 2.0}, estimator="ls_drem")
+    assert abs(result.errors["feed"][0, -1]) < 1e-9
+
+
 @pytest.mark.parametrize("known", [False, True])
 def test_derivatives_of_inputs_go_along_where_they_are_known(known):
     """Those of outputs never do; of order zero there are values alone."""

@@ -303,6 +303,13 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "parameters is text": (lambda: mine(parameters="R"), "parameters must map names"),
     "parameter is reserved": (lambda: mine(parameters={"exp": 1}), "exp, which is reserved"),
     "parameter is a keyword": (lambda: mine(parameters={"lambda": 1}), "write lambda_"),
+    "input is a keyword": (
+        lambda: mine(inputs={"is": "t", "I": 1}, phi=["is", 0]), "phi[0] = 'is': is is a word of",
+    ),
+    "output is a keyword": (lambda: mine(outputs=["in"], A=[["2*in", 1], [0, 1]]), "write in_ or"),
+    "unknown is a keyword": (
+        lambda: mine(unknowns={"None": 1}, F=[["None"], [0]]), "None is a word of Python",
+    ),
     "parameter of a state": (
         lambda: mine(parameters={"R": "x1", "k": 3}),
         "parameters.R = 'x1': x1 is a state and cannot be used here",

@@ -94,6 +94,7 @@ def test_without_a_remedy_the_state_is_lost_and_a_warning_says_so():
     (warning,) = result.warnings
     assert "1/s" in warning
     assert warning in result.verdict
+    assert "form=strangeness_free feeds no output back" in warning
     growth = next(a for a in result.assumptions if a.name == "Growth of Φ")
     assert not growth.holds
     assert growth.evidence["rate"] == pytest.approx(0.64, abs=0.1)

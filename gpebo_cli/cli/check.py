@@ -43,9 +43,9 @@ _ADVICE = {
     "Assumption 7": "choose another gain (observer.L_w), or use observer=gpebo",
     "uniform observability": "what was learnt before lasts only as long as observer.process is 0; "
     "measure more, or use observer=gpebo, which needs Assumption 2 alone",
-    "Growth of Φ": "the observer's own dynamics are unstable over this horizon: take a remedy "
-    "(observer.remedy=output_injection, reset or current_coordinates), shorten time.horizon, or "
-    "take outputs that see more of the state",
+    "Growth of Φ": "the observer's own dynamics are unstable over this horizon: take a remedy of "
+    "observer=gpebo in continuous time (observer.remedy=output_injection, reset or "
+    "current_coordinates), shorten time.horizon, or take outputs that see more of the state",
 }
 """What to do about an assumption that fails, by its name."""
 

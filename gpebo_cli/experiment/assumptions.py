@@ -306,9 +306,13 @@ def warnings(observation: Observed) -> tuple[str, ...]:
         )
     growth, rate = observation.growth, observation.growth_rate
     if growth is not None and rate is not None and not growth < _GROWTH:
+        evidence = {a.name: a.evidence for a in observation.assumptions}
+        given = evidence.get("Assumption 1", {}).get("form") == "given"
+        rank, states = (evidence.get("Rank of E", {}).get(key) for key in ("rank", "states"))
         found.append(
             f"Φ has grown to {growth:.2g}, at {rate:.3g} 1/s: of its 16 digits the state estimate "
-            f"loses {np.log10(growth):.0f}; a remedy is needed, observer.remedy=output_injection, "
-            "reset or current_coordinates; observer.form=strangeness_free feeds no output back"
+            f"loses {np.log10(growth):.0f}; a remedy of observer=gpebo in continuous time is "
+            "needed, observer.remedy=output_injection, reset or current_coordinates"
+            + "; observer.form=strangeness_free feeds no output back" * (given and rank != states)
         )
     return tuple(found)

@@ -15,7 +15,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.model.expressions import RESERVED, Expression, parse, shorten, signal
+from gpebo_cli.model.expressions import RESERVED, Expression, no_word, parse, shorten, signal
 from gpebo_cli.model.matrix import Side, brief, is_empty, items_of, matrix, per_row
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
 from gpebo_cli.schema import check_keys, counted, listed, nearest
@@ -282,10 +282,7 @@ def read_parameters(
     refused = ChainMap(later, dict(elsewhere))
     for label, item in given.items():
         if keyword.iskeyword(label):
-            raise ConfigError(
-                f"{plant}: parameters has the name {label}, a word of Python that cannot stand "
-                f"in an expression; write {label}_ or another name"
-            )
+            raise ConfigError(f"{plant}: parameters has the name {label}, {no_word(label)}")
         where = f"{plant}: parameters.{label}"
         later[label] = "this parameter itself"
         known[label] = parameters[label] = parse(item, known, where, refused)

@@ -73,7 +73,7 @@ def follow(
     refused_until = t
     iterates, work, change = 0, 0.0, 0.0
     at_rest = Linearised(system, _at_rest(x, t, length, solver))
-    at_rest.taylor(np.array([t]), 0)  # refuses by name
+    _refuse_start(at_rest, t)
     begin, spent = process_time(), list[tuple[float, float]]()
     while t < stop - 1e-12 * time.horizon:
         spent.append((process_time() - begin, t))
@@ -107,6 +107,19 @@ def follow(
     if switched:
         change = max(change, _change(whole, before))
     return Effort(len(pieces), iterates, work, change)
+
+
+def _refuse_start(at_rest: Linearised, t: float) -> None:
+    """Refuse by name what has no value at the outputs that the state at the start t makes."""
+    system, at = at_rest.system, np.array([t])
+    try:
+        at_rest.taylor(at, 0)
+    except ConfigError as error:
+        known = system.coefficients.of_time.taylor(at, 0)
+        y = known.C[0, 0] @ system.initial_state + known.D[0, 0] @ known.u[0, 0]
+        made = zip(system.outputs, y + known.H[0, 0] @ known.theta[0, 0], strict=True)
+        said = ", ".join(f"{name} = {y:.6g}" for name, y in made if name in system.followed)
+        raise ConfigError(f"{error}, where initial_state makes {said}") from None
 
 
 def _refuse_slow(

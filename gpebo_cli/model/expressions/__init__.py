@@ -25,11 +25,19 @@ from gpebo_cli.model.expressions.bounds import (
     with_others,
 )
 from gpebo_cli.model.expressions.nodes import divisors_of
-from gpebo_cli.model.expressions.syntax import RESERVED, Expression, parse, shorten, signal
+from gpebo_cli.model.expressions.syntax import (
+    RESERVED,
+    Expression,
+    no_word,
+    parse,
+    shorten,
+    signal,
+)
 from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, on_their_side, record, taylor
 
 __all__ = [
     "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",
-    "blurred", "breakpoints", "divisors_of", "halved", "on_their_side", "parse", "record",
-    "resolved", "resolved_along", "shorten", "signal", "switched", "taylor", "with_others",
+    "blurred", "breakpoints", "divisors_of", "halved", "no_word", "on_their_side", "parse",
+    "record", "resolved", "resolved_along", "shorten", "signal", "switched", "taylor",
+    "with_others",
 ]

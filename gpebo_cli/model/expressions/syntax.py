@@ -9,6 +9,7 @@ import, and repeated symbolic derivatives that grow without bound.
 from __future__ import annotations
 
 import ast
+import keyword
 import math
 import numbers
 import re
@@ -113,10 +114,17 @@ def parse(
     try:
         node = reader.read(_syntax_tree(value), 0)
     except FoldError as error:
-        raise ConfigError(f"{where} = {shorten(value)}: {error}") from None
+        words = (word for word in re.findall(r"\w+", value) if word in {*names, *reader.elsewhere})
+        said = next((f"{w} is {no_word(w)}" for w in words if keyword.iskeyword(w)), error)
+        raise ConfigError(f"{where} = {shorten(value)}: {said}") from None
     except (MemoryError, RecursionError):  # MemoryError: the parser says so
         raise ConfigError(f"{where} = {shorten(value)}: it is nested too deeply") from None
     return Expression(node, value, where, tuple(reader.used.values()))
+
+
+def no_word(name: str) -> str:
+    """Why a name that is a word of Python's, such as ``in``, is refused."""
+    return f"a word of Python that cannot stand in an expression; write {name}_ or another name"
 
 
 def shorten(text: str) -> str:
