@@ -486,17 +486,19 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding
 
 
-def test_a_transient_beside_rounding_is_resolved():
-    """Tails of 1e-5 differ from time to time, and one of 0.4 falls in elements below 1e-6 only."""
-    calls = []
+@pytest.mark.parametrize(("start", "factor"), [(0.0, 2.0), (-1.0, 0.5)])
+def test_a_transient_beside_rounding_is_resolved(start, factor):
+    """Tails of 1e-5 are others at times beside, and one of 0.4 falls in elements below 1e-6 only."""
+    seen = [np.zeros(0)]
 
     def evaluate(mesh, found, kept):
-        calls.append(mesh.size)
-        there = (mesh.edges[:-1] <= 0.3) & (mesh.edges[1:] > 0.3)
-        transient = 0.4 * (mesh.steps > 1e-6)
-        return found, np.where(there, transient, 1e-5 * (1 + len(calls) % 2))
+        moved = len(seen[-1]) == len(mesh.edges) and (seen[-1] != mesh.edges).any()
+        seen.append(mesh.edges)
+        there = (mesh.edges[:-1] <= start + 0.3) & (mesh.edges[1:] > start + 0.3)
+        rounding = 1e-5 * (factor if moved else 1.0)
+        return found, np.where(there, 0.4 * (mesh.steps > 1e-6), rounding)
 
-    mesh, limits = Mesh(np.linspace(0.0, 1.0, 25), radau_rule(8)), {"tol": 1e-9, "name": "law"}
+    mesh, limits = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8)), {"tol": 1e-9, "name": "law"}
     mesh, _, tail = refine(evaluate, mesh, max_elements=99_999, **limits)
     assert tail.max() <= 2e-5
     assert mesh.steps.min() < 1e-6

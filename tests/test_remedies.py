@@ -289,6 +289,9 @@ def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
     eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
     assert eta[0, 0] == 0.7
     np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
+    for reset in observation.regression.resets:  # what is rounding beside the largest of θ and w
+        size = np.abs(np.append(signals.states(np.array([reset.time])), system.theta)).max()
+        assert 1e-4 < reset.floor / size < 1e-2
 
 
 @pytest.mark.parametrize("plant", [one_state(A=[[1]]), one_state(
