@@ -488,7 +488,7 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
 
 @pytest.mark.parametrize(("start", "factor"), [(0.0, 2.0), (-1.0, 0.5)])
 def test_a_transient_beside_rounding_is_resolved(start, factor):
-    """Tails of 1e-5 are others at times beside, and one of 0.4 falls in elements below 1e-6 only."""
+    """Tails of 1e-5 differ at times beside, and one of 0.4 falls in elements below 1e-6 only."""
     seen = [np.zeros(0)]
 
     def evaluate(mesh, found, kept):
@@ -498,8 +498,8 @@ def test_a_transient_beside_rounding_is_resolved(start, factor):
         rounding = 1e-5 * (factor if moved else 1.0)
         return found, np.where(there, 0.4 * (mesh.steps > 1e-6), rounding)
 
-    mesh, limits = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8)), {"tol": 1e-9, "name": "law"}
-    mesh, _, tail = refine(evaluate, mesh, max_elements=99_999, **limits)
+    mesh = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8))
+    mesh, _, tail = refine(evaluate, mesh, tol=1e-9, max_elements=99_999, name="law")
     assert tail.max() <= 2e-5
     assert mesh.steps.min() < 1e-6
     assert mesh.size < 24 * 8 * 8 + 100

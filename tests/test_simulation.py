@@ -670,7 +670,9 @@ def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monk
     """
     for name, value in allowed.items():
         monkeypatch.setattr(f"gpebo_cli.simulation.simulate.{name}", value)
-    system = plant(states=["x", "z"], E=np.eye(2).tolist(), A=[[rate, 0], [0, -1]], initial_state=[0, 0])
+    system = plant(
+        states=["x", "z"], E=[[1, 0], [0, 1]], A=[[rate, 0], [0, -1]], initial_state=[0, 0]
+    )
     with pytest.raises(SolverError, match=why):
         simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
 
