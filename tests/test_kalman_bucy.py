@@ -296,7 +296,8 @@ def test_what_a_mesh_resolves_beside_the_filter_is_the_state_in_units(monkeypatc
     mesh = found.mesh
     _, estimate = found.at(mesh.points.ravel(), mesh.inside.ravel())
     estimate = estimate.reshape(*mesh.points.shape, -1, 1)
-    (x, _), (_, _) = kept[0](estimate, tuple(each.values for each in found.extras))
+    extras = [np.asarray(part.values) for part in found.extras]
+    (x, _), _ = kept[0](estimate, tuple(extras))
     expected = state_map.at(mesh.points[:, 2])(estimate[None, :, 2, :, 0])[0]
     sizes = np.abs(x).max(axis=(0, 1))
     assert ((sizes > 0.1) & (sizes < 10.0)).all()
