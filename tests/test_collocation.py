@@ -21,6 +21,8 @@ from gpebo_cli.numerics.mesh import (
     Trajectory,
     equal_lengths,
     initial_mesh,
+    legendre_tail,
+    signal_scale,
     unresolved,
 )
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -565,6 +567,21 @@ def test_signals_in_units_are_as_well_resolved_as_without():
     waves = np.sin(np.array([0.1, 2.0, 4.0]) * t)
     found = Looked.at(waves * units, rule).unresolved(rule, units)
     np.testing.assert_allclose(found, unresolved(waves, rule), rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_sizes_and_tails_are_in_proportion_to_the_signals(unit):
+    """A component below a thousandth of the largest one is measured by that."""
+    rule, waves = radau_rule(8), np.array([0.5, 3.0, 6.0])
+    t = (np.arange(5)[:, None] + rule.points)[..., None]
+    signals = np.array([1.0, 0.2, 1e-5]) * np.sin(waves * t)
+    scale = signal_scale(signals)
+    np.testing.assert_allclose(scale, [np.sin(0.5 * np.pi), 0.2, 1e-3], rtol=1e-2)
+    np.testing.assert_allclose(signal_scale(unit * signals), unit * scale, rtol=1e-12)
+    tail = legendre_tail(signals, rule, scale)
+    assert (tail < scale).all()
+    np.testing.assert_allclose(legendre_tail(unit * signals, rule, unit * scale), unit * tail)
+    np.testing.assert_allclose(unresolved(unit * signals, rule), unresolved(signals, rule))
 
 
 def test_a_signal_is_not_given_where_it_was_not_kept():
