@@ -90,6 +90,20 @@ def test_zb3_is_not_invented_and_evidence_has_no_sign(signs):
     assert np.isfinite(result.metrics.final_error_states).all()
 
 
+def test_the_output_that_is_asked_for_is_the_one_of_zw():
+    """The third one sees z_b1 and z_b2 three times as well as the second, which comes first."""
+    system = shipped("canonical", outputs=["y1", "y2", "y3"], C=[
+        [1, 0, 0, 0, 0], [0.5, 0, "c1", "c2", 0], [0, 0, "3*c1", "-3*c2", 0],
+    ])
+    found = [
+        {a.name: a.evidence for a in run(system, samples=11, **asked).assumptions}["Assumption 6"]
+        for asked in ({}, {"output": "y2"}, {"output": "y3"})
+    ]
+    assert [each["output"] for each in found] == ["y2", "y2", "y3"]
+    for name in ("smallest_c1", "smallest_c2"):
+        assert found[2][name] == pytest.approx(3.0 * found[0][name], rel=1e-12)
+
+
 @pytest.mark.parametrize("sign", ["", "-"])
 @pytest.mark.parametrize(
     ("sees", "known"), [("(2 + sin(t))", True), ("cos(t)", False), ("step(t - 1)", False)]

@@ -21,6 +21,8 @@ from gpebo_cli.numerics.mesh import (
     Trajectory,
     equal_lengths,
     initial_mesh,
+    legendre_tail,
+    signal_scale,
     unresolved,
 )
 from gpebo_cli.numerics.problem import Constraints, LinearEquation, LinearProblem
@@ -486,18 +488,20 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding
 
 
-def test_a_transient_beside_rounding_is_resolved():
-    """Tails of 1e-5 differ from time to time, and one of 0.4 falls in elements below 1e-6 only."""
-    calls = []
+@pytest.mark.parametrize(("start", "factor"), [(0.0, 2.0), (-1.0, 0.5)])
+def test_a_transient_beside_rounding_is_resolved(start, factor):
+    """Tails of 1e-5 differ at times beside, and one of 0.4 falls in elements below 1e-6 only."""
+    seen = [np.zeros(0)]
 
     def evaluate(mesh, found, kept):
-        calls.append(mesh.size)
-        there = (mesh.edges[:-1] <= 0.3) & (mesh.edges[1:] > 0.3)
-        transient = 0.4 * (mesh.steps > 1e-6)
-        return found, np.where(there, transient, 1e-5 * (1 + len(calls) % 2))
+        moved = len(seen[-1]) == len(mesh.edges) and (seen[-1] != mesh.edges).any()
+        seen.append(mesh.edges)
+        there = (mesh.edges[:-1] <= start + 0.3) & (mesh.edges[1:] > start + 0.3)
+        rounding = 1e-5 * (factor if moved else 1.0)
+        return found, np.where(there, 0.4 * (mesh.steps > 1e-6), rounding)
 
-    mesh, limits = Mesh(np.linspace(0.0, 1.0, 25), radau_rule(8)), {"tol": 1e-9, "name": "law"}
-    mesh, _, tail = refine(evaluate, mesh, max_elements=99_999, **limits)
+    mesh = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8))
+    mesh, _, tail = refine(evaluate, mesh, tol=1e-9, max_elements=99_999, name="law")
     assert tail.max() <= 2e-5
     assert mesh.steps.min() < 1e-6
     assert mesh.size < 24 * 8 * 8 + 100
@@ -563,6 +567,21 @@ def test_signals_in_units_are_as_well_resolved_as_without():
     waves = np.sin(np.array([0.1, 2.0, 4.0]) * t)
     found = Looked.at(waves * units, rule).unresolved(rule, units)
     np.testing.assert_allclose(found, unresolved(waves, rule), rtol=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-8, 1e8])
+def test_sizes_and_tails_are_in_proportion_to_the_signals(unit):
+    """A component below a thousandth of the largest one is measured by that."""
+    rule, waves = radau_rule(8), np.array([0.5, 3.0, 6.0])
+    t = (np.arange(5)[:, None] + rule.points)[..., None]
+    signals = np.array([1.0, 0.2, 1e-5]) * np.sin(waves * t)
+    scale = signal_scale(signals)
+    np.testing.assert_allclose(scale, [np.sin(0.5 * np.pi), 0.2, 1e-3], rtol=1e-2)
+    np.testing.assert_allclose(signal_scale(unit * signals), unit * scale, rtol=1e-12)
+    tail = legendre_tail(signals, rule, scale)
+    assert (tail < scale).all()
+    np.testing.assert_allclose(legendre_tail(unit * signals, rule, unit * scale), unit * tail)
+    np.testing.assert_allclose(unresolved(unit * signals, rule), unresolved(signals, rule))
 
 
 def test_a_signal_is_not_given_where_it_was_not_kept():

@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
-from gpebo_cli.observers import SignalNoise, observe
+from gpebo_cli.observers import SignalNoise, kalman_bucy, observe
 from gpebo_cli.observers._riccati import run_filter
 from gpebo_cli.observers.kalman_bucy import NoiseModel, filter_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
@@ -271,6 +271,37 @@ def test_no_word_of_noise_is_noise_of_size_zero():
         found = observe(system, measured, SOLVER, name="kalman_bucy")
         deviations.append(np.hstack(found.state_map.deviations(t)))
     np.testing.assert_array_equal(*deviations)
+    assert np.isfinite(deviations[0]).all()
+
+
+def test_what_a_mesh_resolves_beside_the_filter_is_the_state_in_units(monkeypatch):
+    """Of a state of 1e4 and one of 1e-3, and of an unknown of 1e5: none counts for another."""
+    kept = []
+
+    def watched(*arguments, monitor, **settings):
+        kept.append(monitor)
+        return filter_windows(*arguments, monitor=monitor, **settings)
+
+    filter_windows = kalman_bucy.filter_windows
+    monkeypatch.setattr(kalman_bucy, "filter_windows", watched)
+    system = plant_from_mapping({
+        "name": "two", "states": ["a", "b"], "inputs": {"u": "1 + sin(t)"}, "outputs": ["y"],
+        "unknowns": {"k": 1e5}, "E": [[1, 0], [0, 0]], "A": [[-1, 0], [1e-7, -1]],
+        "B": [[1e4], [1e-3]], "F": [["0.1*cos(3*t)"], [0]], "C": [[1e-4, 0]],
+        "initial_state": [1e4, 2e-3],
+    })
+    signals = simulate(system, TimeSettings(horizon=4.0), SOLVER).signals
+    state_map = observe(system, seen(signals), SOLVER, name="kalman_bucy").state_map
+    found = state_map.filtered
+    mesh = found.mesh
+    _, estimate = found.at(mesh.points.ravel(), mesh.inside.ravel())
+    estimate = estimate.reshape(*mesh.points.shape, -1, 1)
+    extras = [np.asarray(part.values) for part in found.extras]
+    (x, _), _ = kept[0](estimate, tuple(extras))
+    expected = state_map.at(mesh.points[:, 2])(estimate[None, :, 2, :, 0])[0]
+    sizes = np.abs(x).max(axis=(0, 1))
+    assert ((sizes > 0.1) & (sizes < 10.0)).all()
+    np.testing.assert_allclose(x[:, 2] / x[-1, 2], expected / expected[-1], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -246,10 +246,11 @@ def _by_steps(E, A, B, F, C, rows, scale, domain, range_, kernel, equations):
     )
 
 
-def _regression(rng, times=11, n=4, k=2, q=1, rows=3, b=2, one=False):
+def _regression(rng, times=11, n=4, k=2, q=1, rows=3, b=2, one=False, axes=None):
     of_time = 1 if one else times
+    basis = rng.normal(size=(n, k)) if axes is None else np.eye(n)[:, axes]
     return (
-        rng.normal(size=(times, k, 1 + q + k)), q, rng.normal(size=(n, k)),
+        rng.normal(size=(times, k, 1 + q + k)), q, basis,
         rng.normal(size=(of_time, rows, k)), rng.normal(size=(times, rows)),
         rng.normal(size=(of_time, rows, q)),
         np.linalg.qr(rng.normal(size=(of_time, rows, b)))[0], rng.normal(size=(of_time, n, b)),
@@ -264,6 +265,8 @@ CASES: list[tuple[str, str, Case]] = [
     ("observer", "in_frame", partial(_in_frame, n=6, r=3)),
     ("observer", "regression_signals", _regression),
     ("observer", "regression_signals", partial(_regression, q=0, one=True)),
+    ("observer", "regression_signals", partial(_regression, axes=[1, 2])),
+    ("observer", "regression_signals", partial(_regression, q=2, axes=[0, 3])),
     ("structure", "reference", _start),
     ("structure", "reference", partial(_start, n=5)),
     ("structure", "reference", partial(_start, n=4, turned=True)),

@@ -645,6 +645,24 @@ def test_a_start_does_not_depend_on_units_of_equations_and_states(build):
     np.testing.assert_allclose(columns * starts[1], starts[0], atol=1e-11)
 
 
+def pulled(cells):
+    """Index 3, where the force that holds the last mass pulls at its neighbour, too."""
+    E, A, B, C = chain(cells)
+    A[-3, -1] = 0.5
+    return E, A, B, C
+
+
+def test_a_start_takes_the_slopes_of_what_moves_in_straight_lines():
+    """Both ways, from states that the constraints do not allow."""
+    _, A, _, _ = pulled(CELLS)
+    moving = [[f"{v}*(1 + {0.02 * ((i + j + 1) % 3)}*t)" if v else 0 for j, v in enumerate(row)]
+              for i, row in enumerate(A.tolist())]
+    x0 = np.random.default_rng(2).normal(size=len(A))
+    found, dense = both(plant(pulled, u="1 + t", A=moving, initial_state=x0.tolist()))
+    assert np.abs(found.initial_state - x0).max() > 0.1
+    np.testing.assert_allclose(found.initial_state, dense.initial_state, atol=1e-11)
+
+
 def test_a_full_plant_starts_from_what_constraints_leave_of_its_momenta():
     """M (v − v₀) is a combination of rows of J, J v = 0, and p follows from the derivative."""
     rng = np.random.default_rng(4)

@@ -191,7 +191,7 @@ def test_a_long_filter_runs_window_by_window(observer, estimator, monkeypatch):
     made = run("descriptor", observer="none", time={"horizon": 6.0, "samples": 151})
     names, rng = [*made.inputs, *made.outputs], np.random.default_rng(0)
     data = {"t": made.t, **{name: made[name] + 0.01 * rng.standard_normal(151) for name in names}}
-    found = []
+    found, errors = [], []
     for window in (10**6, 16):
         monkeypatch.setattr(mesh, "_WINDOW", window)
         monkeypatch.setattr(linear, "_WINDOW", window)
@@ -200,6 +200,7 @@ def test_a_long_filter_runs_window_by_window(observer, estimator, monkeypatch):
         ).details
         made = details.estimation
         assert details.regression.error_estimate < 1e-6
+        errors.append(details.regression.error_estimate)
         reached = made.requirement.evidence.values() if observer != "kalman_bucy" else ()
         found.append(
             [made.parameters, made.states, made.parameters_std, made.states_std, *reached]
@@ -207,6 +208,7 @@ def test_a_long_filter_runs_window_by_window(observer, estimator, monkeypatch):
     for windows, whole in zip(found[1], found[0], strict=True):
         if whole is not None:
             np.testing.assert_allclose(windows, whole, rtol=2e-7, atol=1e-11)
+    assert errors[0] / 10 < errors[1] < 10 * errors[0]
 
 
 @pytest.mark.parametrize("name", ["descriptor", "steps"])

@@ -20,7 +20,7 @@ from processes import assert_refused, refused
 from regressions import ETA, three
 from regressions import regression as make_regression
 from scipy.integrate import solve_ivp
-from scipy.linalg import expm
+from scipy.linalg import expm, sqrtm
 from test_observer import ROTATING
 
 from gpebo_cli import estimators
@@ -290,6 +290,9 @@ def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
     eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
     assert eta[0, 0] == 0.7
     np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
+    for reset in observation.regression.resets:  # what is rounding beside the largest of θ and w
+        size = np.abs(np.append(signals.states(np.array([reset.time])), system.theta)).max()
+        assert 1e-4 < reset.floor / size < 1e-2
 
 
 @pytest.mark.parametrize("plant", [one_state(A=[[1]]), one_state(
@@ -521,6 +524,32 @@ def test_a_gain_of_ones_own_moves_the_eigenvalues():
     np.testing.assert_allclose(
         observation.state_map.gain(np.array([5.0]))[0], -Phi, atol=1e-10
     )
+
+
+def test_the_automatic_gain_is_that_of_its_riccati_equation():
+    """E = I: Φ' = (A − S CᵀWC) Φ with W of the weights, by scipy together with S."""
+    turning, rows = "1 + 0.5*sin(2*t)", np.array([[1.0, 0.5], [0.0, 1.0]])
+    system = plant_from_mapping({
+        "name": "turning", "states": ["a", "b"], "outputs": ["y", "z"], "E": [[1, 0], [0, 1]],
+        "A": [[0.3, turning], [-1, 0.2]], "C": rows.tolist(), "initial_state": [1, 1],
+    })
+    W = rows.T @ np.diag([1.0, 0.25]) @ rows
+
+    def A(t):
+        return np.array([[0.3, 1.0 + 0.5 * np.sin(2.0 * t)], [-1.0, 0.2]])
+
+    def slope(t, v):
+        S, Phi = v.reshape(2, 2, 2)
+        driven = 0.01 * (A(t) @ A(t).T + 0.01 * (A(t) ** 2).sum() * np.eye(2))
+        dS = A(t) @ S + S @ A(t).T + driven - S @ W @ S
+        return np.concatenate([dS, (A(t) - S @ W) @ Phi]).ravel()
+
+    start = np.concatenate([np.real(sqrtm(A(0.0) @ A(0.0).T)), np.eye(2)]).ravel()
+    t = np.linspace(0.0, 6.0, 13)
+    expected = solve_ivp(slope, (0.0, 6.0), start, t_eval=t, rtol=1e-10, atol=1e-13).y[4:].T
+    _, found = along(system, 6.0, remedy="output_injection", weights={"z": 0.5, "y": 2})
+    gain = found.state_map.gain(t).reshape(-1, 4)
+    np.testing.assert_allclose(gain, -expected, atol=1e-6 * np.abs(expected[-1]).max())
 
 
 def test_the_automatic_gain_does_not_depend_on_units():

@@ -181,6 +181,21 @@ def test_the_error_estimate_is_of_the_estimate_where_the_covariance_rests():
     assert 0.1 < rough.error_estimate / wrong < 10.0
 
 
+@pytest.mark.parametrize("seen", [1.0, 1e-2])
+def test_the_error_estimate_of_a_covariance_is_in_deviations(seen):
+    """Also where the filter has little to go by: as the state is driven so its deviations move."""
+    case, t = varying(), np.linspace(0.0, 6.0, 500)
+    driven = replace(
+        case, c=lambda t: seen * case.c(t), z=lambda t: np.zeros(1), b=lambda t: np.zeros(3),
+        into=lambda t: np.exp(1.5 * np.sin(4.0 * t)) * case.into(t),
+    )
+    rough, fine = (
+        driven.filtered(np.zeros(3), 1e-3 * np.eye(3), 6.0, 6, tol) for tol in (1e-3, 1e-12)
+    )
+    wrong = relative(rough.at(t)[0], fine.at(t)[0])
+    assert 0.1 < rough.error_estimate / wrong < 10.0
+
+
 def test_many_elements_take_few_stages_and_lose_nothing():
     """Where samples have made elements short, a high order would be paid for nothing."""
     case, start, P0, t = varying(), np.zeros(3), 10.0 * np.eye(3), np.linspace(0.5, 20.0, 40)

@@ -682,13 +682,18 @@ def test_up_to_the_time_at_which_growth_is_refused_a_state_is_known(rate, elemen
 @pytest.mark.parametrize(("rate", "allowed", "why"), [
     ("2000", {}, r"e\^4e\+03, at 2e\+03 1/s near t = 0, .* the 100 elements that solver\.max"),
     ("1500*t**2", {}, r"e\^4e\+03, at 6e\+03 1/s near t = 1\.999\d*, .* the 100 elements"),
-    ("2000", {"_MOST_FOR_GROWTH": 500}, r"the [1-9]\d elements that the size 1 of A allows"),
+    ("2000", {"_MOST_FOR_GROWTH": 2800}, r"the 50 elements that the size 2 of A allows"),
 ])
 def test_growth_that_takes_too_many_elements_is_refused(rate, allowed, why, monkeypatch):
-    """By e^∫λ, with the largest λ and its time, and what sets the limit: a setting, or memory."""
+    """By e^∫λ, with the largest λ and its time, and what sets the limit: a setting, or memory.
+
+    That of all elements is 2 · 2 numbers at each of 14 points.
+    """
     for name, value in allowed.items():
         monkeypatch.setattr(f"gpebo_cli.simulation.simulate.{name}", value)
-    system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state=[0])
+    system = plant(
+        states=["x", "z"], E=[[1, 0], [0, 1]], A=[[rate, 0], [0, -1]], initial_state=[0, 0]
+    )
     with pytest.raises(SolverError, match=why):
         simulate(system, TimeSettings(horizon=2.0), SolverSettings(max_elements=100))
 

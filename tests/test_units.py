@@ -230,6 +230,8 @@ def test_a_kalman_filter_is_the_same_in_any_units(name, moving):
     for key in ("window", "window_start"):
         y[key] /= units.time
     assert y == pytest.approx(x, rel=1e-6)
+    errors = [run.regression.error_estimate for run in (one, other)]
+    assert errors[0] / 10 < errors[1] < 10 * errors[0]
     # Of 1 nothing is seen: 0 is no evidence of 0.
     assert one.estimation.requirement.holds == (name in TURNING)
 

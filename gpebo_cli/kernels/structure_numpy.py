@@ -256,8 +256,7 @@ def in_own_states(
     T, W1 = inverse[:, :, :d] @ inverses(R), np.swapaxes(Q, 1, 2) * rows
     E1, A2 = W1 @ E, A2 / columns
     of_f2 = inverse[:, :, d:] - T @ (E1 @ inverse[:, :, d:])
-    some = slice(0, None, every) if len(inverse) > 1 else slice(None)
-    amplification = (np.abs(of_f2[some]) @ size).max(axis=0)
+    amplification = (np.abs(of_f2[::every]) @ size).max(axis=0)
     amplification[:, :-1] /= columns
     offset = -(of_f2 @ f2)
     # Of components beside which others are large the inverse leaves rounding of these.

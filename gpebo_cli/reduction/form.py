@@ -234,13 +234,12 @@ def hidden_constraints(
     Q, R = np.linalg.qr(transpose(without_rounding(A2 / size)))  # Â2 = RᵀQᵀ
     inverse = Q @ transpose(np.linalg.inv(R))
     inward = exact_product(inverse, f2)  # Â2⁺ [f̂_v | f̂_θ]
-    some = slice(0, None, every if len(A2) > 1 else 1)
-    made_of = made_of[:, :, :n] / s.columns / size[some]
+    made_of = made_of[:, :, :n] / s.columns / size[::every]
     driving = (mu + 1) * system.m + 1
     return HiddenConstraints(
         without_rounding(Q @ transpose(Q)) / units,
         inward[:, :, :driving], inward[:, :, driving:],
-        (np.abs(inverse[some]) @ made_of).max(axis=0),
+        (np.abs(inverse[::every]) @ made_of).max(axis=0),
     )
 
 
