@@ -952,6 +952,26 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+def test_assumption_1_is_judged_by_the_weakest_of_several_files(tmp_path):
+    """[ΠA; C] is c = 1 + cos(t)/2 on the kernel of E, beside 1: weakest at t = π, in one file."""
+    plant = {
+        "name": "p", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, 0]], "B": [[0], [1]],
+        "C": [[0, "1 + cos(t)/2"]], "initial_state": [0, 0],
+    }
+    files = []
+    for start in (0.0, 3.0):
+        made = run(plant, observer="none", time={"start": start, "horizon": 1.0, "samples": 41})
+        table = made.to_pandas("signals").reset_index()[["t", "u", "y"]]
+        files.append(write_table(tmp_path / f"{start}.csv", table))
+    form = {"name": "gpebo", "form": "given"}
+    for data, shift in ((files, -2.0), (files[::-1], 0.0)):
+        found = run(plant, data=data, observer=form, time={"samples": 5}).details.assumptions
+        (one,) = (a.evidence for a in found if a.name == "Assumption 1")
+        assert one["smallest_singular_value"] == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
+        assert one["at"] == pytest.approx(np.pi + shift, abs=0.03)
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])
