@@ -837,6 +837,10 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,2.5\n")
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing, found.doubts) == ([9999.0], 2, [])
+    for cell in ("9999", "9999,0"):  # of which there is nothing else, or which are no numbers
+        path.write_text(f"t;V;y\n0;1.5;{cell}\n1;99.9;{cell}\n2;3.2;{cell}\n3;2.1;{cell}\n")
+        found = guess(str(path), shipped("circuit"))
+        assert (found.gaps, found.missing) == ([], 0)
     path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,9500\n")
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing) == ([], 0)
