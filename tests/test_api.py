@@ -8,6 +8,7 @@ import os
 import sys
 import time
 from html import escape
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -388,7 +389,8 @@ def test_an_estimator_of_ones_own(tmp_path):
     assert "does not repeat the run" in text
     with pytest.raises(ConfigError, match=r"gamma given beside an estimator object"):
         run("descriptor", estimator=names["Ridge"](), gamma=1)
-    for wrong in (3, names["Ridge"]):
+    halves = SimpleNamespace(cases=({},)), SimpleNamespace(estimate=print)
+    for wrong in (3, names["Ridge"], *halves):
         with pytest.raises(ConfigError, match="an object with cases and estimate"):
             run("descriptor", estimator=wrong)
 

@@ -479,10 +479,20 @@ def test_under_noise_the_time_to_settle_stands_for_that_to_one_percent(
 def test_deviations_are_drawn_about_a_single_case(gammas: tuple[float, ...], bands: int) -> None:
     result = make_result(gammas, samples=11)
     estimation = estimation_of(result)
-    spread = replace(estimation, states_std=np.ones_like(estimation.states))
-    panels = describe(replace(result, estimation=spread), ["estimates_a"])["estimates_a"]
-    for panel in panels:
-        assert sum(curve.label == "± 2σ" for curve in panel.curves) == bands
+    spread = replace(estimation, states_std=np.full_like(estimation.states, 3.0))
+    for error in ("log", "linear"):
+        output = replace(result.settings.output, error=error)
+        told = replace(result, estimation=spread, settings=replace(result.settings, output=output))
+        for panel in (p for own in describe(told, ["estimates_a", "state_error_a"]).values()
+                      for p in own):
+            found = [curve for curve in panel.curves if curve.label.endswith("2σ")]
+            assert len(found) == bands
+            for band in found:  # about the estimate, or about no error
+                middle = panel.curves[1].y if panel.curves[0].label == "true" else 0.0
+                np.testing.assert_allclose(band.y - middle, 6.0)
+                assert (band.down_to is None) == panel.log
+                if band.down_to is not None:
+                    np.testing.assert_allclose(band.down_to - middle, -6.0)
 
 
 def test_unknown_figures_are_refused_at_once() -> None:

@@ -649,6 +649,12 @@ def test_mistakes_in_mechanics(change, message):
         from_mechanics({**SLIDER_CRANK, **change}, "rod", "rod.yaml")
 
 
+def test_a_measured_position_has_its_unit():
+    units = {"q1": "rad", "v_q2": "m/s", "force": "N"}
+    plant = from_mechanics({**SLIDER_CRANK, "measure": ["q1"], "units": units}, "rod").mapping()
+    assert plant["units"] == {**units, "y_q1": "rad"}
+
+
 MARKET = "%%MatrixMarket matrix array real general\n1 1\n-1\n"
 A = np.array([[0.0, 1.0], [-2.0, -0.3]])
 B, C = np.array([[0.0], [1.0]]), np.array([[1.0, 0.0]])

@@ -224,6 +224,13 @@ def test_a_launcher_that_is_not_installed_is_one_line_with_the_extra(tmp_path):
     assert_refused(done, "pip install 'gpebo[ray]'")
 
 
+@pytest.mark.parametrize("must", [True, False])
+def test_a_worker_whose_starter_has_ended_before_it_is_followed_ends_where_it_must(must):
+    ended = f"from gpebo_cli.cli.workers import follow; follow({2**31 - 1}, must={must})"
+    done = python("-c", f"{ended}; import time; time.sleep({5.0 if must else 0.1})")
+    assert done.returncode == must
+
+
 BLOCKED = """
 import signal
 from joblib.externals.loky.backend import resource_tracker

@@ -13,6 +13,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
 from gpebo_cli.evidence.groups import each_alone, grouped
+from gpebo_cli.experiment import fit
 from gpebo_cli.experiment.fit import _follows, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
@@ -369,6 +370,18 @@ def test_what_follows_an_input_far_below_the_noise_is_told_and_white_noise_does_
     assert np.mean([_varies_slowly(e + late) for e in white]) < 0.1
     assert not _follows(white[0] + late, inputs[:, 1:2])
     assert not _follows(white[0] + late, inputs[:, :0])
+
+
+@pytest.mark.parametrize("outputs", [1, 3])
+def test_white_noise_is_taken_for_a_misfit_as_often_as_is_asked_for(outputs, monkeypatch):
+    """Once in twenty times, by what follows an input, in any unit, and by the mean of few."""
+    monkeypatch.setattr(fit, "_RARE", 0.05)
+    rng = np.random.default_rng(0)
+    white, inputs = rng.standard_normal((500, 160, outputs)), rng.standard_normal((160, 2))
+    follows = [_follows(e, inputs) for e in white]
+    assert 0.03 < np.mean(follows) < 0.07
+    assert follows[:50] == [_follows(e + 9.0, [1e-6, 1e3] * inputs + 1e-3) for e in white[:50]]
+    assert 0.03 < np.mean([_varies_slowly(e[:24]) for e in white]) < 0.1
 
 
 @pytest.mark.parametrize(("count", "told"), [(13, False), (14, True)])

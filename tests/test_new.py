@@ -69,6 +69,7 @@ def test_a_recipe_runs_and_is_drawn(tmp_path):
     path.write_text(path.read_text().replace("horizon: 20, samples: 1001", "horizon: 2"))
     printed(gpebo("figures", "two_gains", "--config-dir", ".", "--output", "drawn", cwd=tmp_path))
     assert "fast and slow gains" in (tmp_path / "drawn" / "index.html").read_text()
+    assert not list((tmp_path / "drawn").rglob("*circuit*"))  # that is the paper's
     wrong = gpebo("figures", "two_gain", "--config-dir", ".", cwd=tmp_path)
     assert "did you mean two_gains?" in wrong.stderr
 

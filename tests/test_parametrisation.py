@@ -11,7 +11,7 @@ from regressions import adjugate, integrate
 from scipy.integrate import trapezoid
 from scipy.optimize import least_squares
 
-from gpebo_cli import ConfigError, estimators, run
+from gpebo_cli import ConfigError, SolverError, estimators, run
 from gpebo_cli.estimators import LinearRegression
 from gpebo_cli.regression.text import regression_from_mapping
 
@@ -233,6 +233,14 @@ def test_the_monotone_gradient_of_one_unknown_begins_where_it_should(unit):
     energy = made.t - (1.0 - x) / 2.0 + (1.0 - x**2) / 8.0
     found = made.estimates["a"][0] / unit
     np.testing.assert_allclose(found, 2.0 + 2.0 * np.exp(-1.5 * energy), atol=1e-9)
+
+
+@pytest.mark.filterwarnings("ignore:lsoda")
+def test_a_monotone_gradient_that_cannot_be_integrated_is_refused():
+    one = {"name": "one", "unknowns": {"a": 2}, "box": {"a": [0, 8]}, "S": ["a"], "psi": [["1"]]}
+    with pytest.raises(SolverError, match="the monotone law cannot be integrated: "):
+        run(regression=one, time={"horizon": 3, "samples": 2},
+            estimator={"name": "monotone", "gamma": 1e200, "lambda": 4.0, "T": [[1]]})
 
 
 def test_errors_of_the_monotone_gradient_are_its_linearisation():

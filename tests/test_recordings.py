@@ -885,6 +885,10 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
     path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,2.5\n")
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing, found.doubts) == ([9999.0], 2, [])
+    for cell in ("9999", "9999,0"):  # of which there is nothing else, or which are no numbers
+        path.write_text(f"t;V;y\n0;1.5;{cell}\n1;99.9;{cell}\n2;3.2;{cell}\n3;2.1;{cell}\n")
+        found = guess(str(path), shipped("circuit"))
+        assert (found.gaps, found.missing) == ([], 0)
     path.write_text("t,V,y\n0,1,9999\n1,999,2\n2,3,9999\n3,2,9500\n")
     found = guess(str(path), shipped("circuit"))
     assert (found.gaps, found.missing) == ([], 0)
@@ -1030,6 +1034,26 @@ def test_a_span_with_one_row_has_no_residual_to_look_at(time):
     t = np.linspace(0.0, 2.0, 21)
     result = run(one_state(), data={"t": t, "y": np.exp(-t)}, time=time)
     assert result.details.fit.white is None
+
+
+def test_assumption_1_is_judged_by_the_weakest_of_several_files(tmp_path):
+    """[ΠA; C] is c = 1 + cos(t)/2 on the kernel of E, beside 1: weakest at t = π, in one file."""
+    plant = {
+        "name": "p", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, 0]], "B": [[0], [1]],
+        "C": [[0, "1 + cos(t)/2"]], "initial_state": [0, 0],
+    }
+    files = []
+    for start in (0.0, 3.0):
+        made = run(plant, observer="none", time={"start": start, "horizon": 1.0, "samples": 41})
+        table = made.to_pandas("signals").reset_index()[["t", "u", "y"]]
+        files.append(write_table(tmp_path / f"{start}.csv", table))
+    form = {"name": "gpebo", "form": "given"}
+    for data, shift in ((files, -2.0), (files[::-1], 0.0)):
+        found = run(plant, data=data, observer=form, time={"samples": 5}).details.assumptions
+        (one,) = (a.evidence for a in found if a.name == "Assumption 1")
+        assert one["smallest_singular_value"] == pytest.approx(0.5 / np.sqrt(1.25), rel=1e-4)
+        assert one["at"] == pytest.approx(np.pi + shift, abs=0.03)
 
 
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):

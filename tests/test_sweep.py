@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.utils import JobReturn, JobStatus
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
@@ -151,6 +152,16 @@ def test_what_a_launcher_refuses_is_no_launcher_that_gave_up(tmp_path):
     orders = OmegaConf.create({"max_batch_size": None, "fail_fast": False})
     with pytest.raises(ConfigError, match="n=1"):
         _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
+
+
+def test_what_keeps_a_job_from_its_record_is_said_of_that_job(tmp_path):
+    """A full disk for instance; of jobs that are done nothing is said."""
+    returned = [JobReturn(_return_value=0, status=JobStatus.COMPLETED),
+                JobReturn(_return_value=OSError("no\nspace"), status=JobStatus.FAILED)]
+    orders, errors = OmegaConf.create({"max_batch_size": None, "fail_fast": False}), {}
+    launcher = SimpleNamespace(launch=lambda batch, initial_job_idx: returned)
+    assert _launch([["n=1"], ["n=2"]], [0, 1], tmp_path, orders, launcher, errors) == ""
+    assert errors == {1: "OSError: no space"}
 
 
 def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):

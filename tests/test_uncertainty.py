@@ -17,7 +17,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.metrics import settling_times
-from gpebo_cli.evidence.uncertainty import deviations, noise_level
+from gpebo_cli.evidence.uncertainty import _layered, deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.experiment.result import Fit
@@ -641,6 +641,16 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
     (f, s), decayed = error_maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
     np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_layers_are_behind_samples_before_what_is_looked_at_in_any_unit_of_time(unit):
+    """Down to a time constant, 1/20 of an element; nodes and what no sample begins need none."""
+    mesh, samples = Mesh(unit * np.arange(4.0), radau_rule(6)), unit * np.array([0.0, 2.0])
+    t = unit * np.array([0.5, 1.5, 3.0])
+    made = _layered(mesh, samples, 20.0 / unit, t)
+    np.testing.assert_allclose(made.edges / unit, [0, 1 / 27, 1 / 9, 1 / 3, 1, 2, 3], atol=1e-15)
+    assert _layered(mesh, samples, 0.9 / unit, t) is mesh
 
 
 @pytest.mark.parametrize("apart", [True, False])

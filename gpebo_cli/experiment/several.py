@@ -15,6 +15,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.sources import Source
+from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, joined
 from gpebo_cli.observers import AffineStateMap, Observation
@@ -139,10 +140,27 @@ def joined_observation(
             affine[0].units,
         ),
         truth=truth, error_estimate=max(each.error_estimate for each in observations),
+        assumptions=_weakest([each.assumptions for each in observations], shifts),
         growth=max(growth, default=None), growth_rate=max(rates, default=None), respond=None,
         errors=one_after_another(starts, errors_at)
         if same and len(errors) == len(observations) else None,
         starts=starts,
+    )
+
+
+def _weakest(
+    found: Sequence[Sequence[Assumption]], shifts: Sequence[float]
+) -> tuple[Assumption, ...]:
+    """Of each assumption the one of the recording in which it holds least, at the time of all."""
+    def moved(a: Assumption, by: float) -> Assumption:
+        at = a.evidence.get("at")
+        return replace(a, evidence={**a.evidence, "at": at + by}) if isinstance(at, float) else a
+
+    def margin(a: Assumption) -> tuple[bool, float]:
+        return a.holds, float(a.evidence.get("smallest_singular_value") or 0.0)
+
+    return tuple(
+        min(map(moved, each, shifts), key=margin) for each in zip(*found, strict=True)
     )
 
 
