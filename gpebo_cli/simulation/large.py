@@ -212,8 +212,9 @@ def _simulated(
     form = plant.eliminate(mesh, _SOME)
     if not form.d:
         return None  # there is nothing to integrate, and the derivative array has all states
-    moves = isinstance(form, ConstantForm) or form.shifts or not _smooth(plant, mesh, cuts)
-    if len(cuts) and moves:
+    if len(cuts) and (
+        isinstance(form, ConstantForm) or form.shifts or not _smooth(plant, mesh, cuts)
+    ):
         return None  # what jumps then is for the derivative array to say
     M, units = form.matrix, form.units
     shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), TINY)
