@@ -183,6 +183,7 @@ def star(cells):
 
 @pytest.mark.parametrize(("system", "most"), [
     (lambda: plant(source_on_a_node, u="sin(t) + step(t - 3)"), 999),  # a jump has an impulse
+    (lambda: plant(chain, u="abs(sin(t))"), 999),
     (lambda: plant(ladder), 7),  # elements
     (lambda: plant(star, varying=True, cells=60), 999),  # elimination fills what is sparse
 ])
@@ -209,6 +210,24 @@ def test_a_jump_of_the_input_moves_algebraic_states_only():
     assert t == when == 3.0
     np.testing.assert_allclose(jump.after, other.after, atol=1e-9)
     np.testing.assert_allclose(jump.after[:-1], before[:-1], atol=1e-12)
+
+
+@pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize(("build", "u"), [
+    (source_on_a_node, "abs(sin(t))"), (current_source, "sin(t) + step(t - 3)*(t - 3)"),
+    (tied, "max(sin(t), 0.3)"), (chain, "sin(t) + step(t - 3)*(t - 3)**2"),
+])
+def test_a_derivative_that_jumps_at_the_end_of_hidden_constraints_moves_no_other_state(
+    build, u, varying
+):
+    found, dense = both(plant(build, u=u, varying=varying))
+    t = np.linspace(0.05, TIME.horizon, 40)
+    x, true = found.signals.states(t), dense.signals.states(t)
+    np.testing.assert_allclose(x, true, atol=1e-9 * np.abs(true).max())
+    for (when, _, jump), (same, _, other) in zip(found.jumps, dense.jumps, strict=True):
+        assert when == pytest.approx(same)
+        np.testing.assert_allclose(jump.after, other.after, atol=1e-8)
+        np.testing.assert_array_equal(jump.impulses, 0.0 * other.impulses)
 
 
 def test_a_narrow_pulse_is_not_overlooked():

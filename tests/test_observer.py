@@ -339,6 +339,21 @@ def test_known_initial_values_are_those_said_or_the_plants(xi_a0, starts):
     np.testing.assert_allclose(found.state_map.gain(np.zeros(1))[0, :, 0], [-1, 0, 0], atol=1e-12)
 
 
+@pytest.mark.parametrize("unknown", [["w"], ["v1"], ["v2", "w"]])
+def test_known_initial_values_are_those_that_constraints_leave(unknown):
+    """Two capacitors are joined at the start; their charge stays, and both voltages jump."""
+    result = experiment({
+        "name": "joined", "states": ["v1", "v2", "i", "w"], "inputs": {"u": "sin(t)"},
+        "outputs": ["y"], "E": np.diag([1.0, 2.0, 0.0, 1.0]),
+        "A": [[-0.1, 0, 1, 0], [0, -0.3, -1, 0], [1, -1, 0, 0], [1, 0, 0, -1]],
+        "B": [[1], [0], [0], [0]], "C": [[0, 0, 1, 1]], "initial_state": [1.0, 0.4, 0.0, 0.5],
+    }, observer={"form": "given", "unknown_initial": unknown}, time={"horizon": 5.0})
+    moved = result.details.simulation.moved
+    assert [change.used for change in moved[:2]] == pytest.approx([0.6, 0.6])
+    for name in ("v1", "v2", "i", "w"):
+        np.testing.assert_allclose(result.estimates[name][0, -1], result[name][-1], atol=1e-11)
+
+
 @pytest.mark.parametrize("observer", ["gpebo", "kalman_bucy"])
 @pytest.mark.parametrize("speed", [1.0, 7.3])
 def test_an_output_that_sees_nothing_is_not_exciting_though_the_kernel_of_E_turns(speed, observer):

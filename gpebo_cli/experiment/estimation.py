@@ -62,6 +62,9 @@ def continuous(
     """The result with observer and estimator as differential equations (SolverError)."""
     settings, system = result.settings, result.system
     t, goes_on = source.t, estimators.goes_on(estimator)
+    begins = system
+    if source.simulation is not None:  # what is known of the start is what constraints leave of it
+        begins = replace(system, initial_state=source.simulation.initial_state)
 
     def observe(signals: Source | Signals) -> Observation:
         known = signals if isinstance(signals, Source) else source
@@ -77,7 +80,7 @@ def continuous(
                 for each in source.pieces if each is not known
             ],
         )
-        return observer.observe(system, seen, settings.solver)
+        return observer.observe(begins, seen, settings.solver)
 
     with stage("observe"):
         observation = (

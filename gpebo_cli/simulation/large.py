@@ -59,6 +59,8 @@ _FULL = 50  # states, beyond which full constant plants are simulated here, too
 _ENTRIES = 4  # per row of E; with more of them E counts as full
 _LENGTH = 2.6  # h‖A‖ of an element: products of two solutions, too, are resolved to 1e-9 there
 _SOME = 5  # at every so many points it is seen how fast states move
+_BESIDE = 1e-3  # of the shortest element: on which side of a cut a point is
+_SAME = 1e-9  # of a value: what it jumps by less is rounding
 _ROUNDING = 32.0  # units in the last place by which a consistent state may miss one asked for
 
 
@@ -210,7 +212,9 @@ def _simulated(
     form = plant.eliminate(mesh, _SOME)
     if not form.d:
         return None  # there is nothing to integrate, and the derivative array has all states
-    if len(cuts) and (form.mu or isinstance(form, ConstantForm) or form.shifts):
+    if len(cuts) and (
+        isinstance(form, ConstantForm) or form.shifts or not _smooth(plant, mesh, cuts)
+    ):
         return None  # what jumps then is for the derivative array to say
     M, units = form.matrix, form.units
     shortest = longest = _LENGTH / max(M.norms(M.sizes(mesh.size), units).max(), TINY)
@@ -274,6 +278,24 @@ def _simulated(
     if solution is None:
         return None
     return _result(plant, solution, x0, cuts, bounded=bounded)
+
+
+def _smooth(plant: _Plant, mesh: Mesh, cuts: Array) -> bool:
+    """Whether no derivative that hidden constraints contain is an impulse at one of the cuts (B,).
+
+    Then x_I does not jump. All that is differentiated has to be the same on both sides.
+    """
+    beside, longest = _BESIDE * mesh.steps.min(), mesh.steps.max()
+    sides = np.concatenate([cuts - beside, cuts + beside])
+    found = entries(plant.system.coefficients, np.tile(cuts, 2), plant.order, sides).values
+    for name in ("E", "A", "B", "F", "phi", "u", "theta"):
+        value = getattr(found, name)
+        if value.shape[1] > 1:
+            before, after = np.split(value, 2, axis=1)
+            size, jump = (np.abs(x).max(axis=1) for x in (value, after - before))
+            if (jump[:-1] > _SAME * (size[:-1] + longest * size[1:])).any():
+                return False
+    return True
 
 
 def _no_coefficients(t: Array, inside: Array) -> LinearEquation:
@@ -374,7 +396,7 @@ def _result(
     wrong += VALUE * EPS * form.loss * made_of
     scale = np.maximum(np.where(own > NOTHING * made_of, own, made_of), TINY)
     state_errors = wrong / scale
-    at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((0, len(x0)))
+    at, none = np.searchsorted(mesh.edges, cuts).tolist(), np.zeros((form.mu, len(x0)))
     jumps = [(float(mesh.edges[k]), x[k - 1, -1], Jump(x[k, 0], none)) for k in at]
     return Simulation(
         signals=Signals(Trajectory(mesh, u), Trajectory(mesh, y), Trajectory(mesh, x)),
