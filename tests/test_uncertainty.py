@@ -352,7 +352,7 @@ def test_what_the_residual_of_a_right_plant_is_coloured_by_is_said():
     said = run(plant, data=right, estimator="ls_drem", beta=1.0).verdict
     assert "not white, that of least squares that weigh each output by its noise is:" in said
     two = plant | {"outputs": ["y", "z"], "C": [[1], [1]]}
-    seen = right | {"y": made["y"] + 0.002 * noise[0], "z": made["y"] + 0.5 * noise[1]}
+    seen = right | {"y": made["y"] + 0.02 * noise[0], "z": made["y"] + 0.5 * noise[1]}
     said = run(two, data=seen, estimator="least_squares").verdict
     assert "not white, that of least squares that weigh each output by its noise is:" in said
     levels = {"name": "gaussian", "outputs": 0.05, "inputs": 1.0}
