@@ -329,8 +329,8 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
     ({"slow": True, "of_inputs": ("u",)}, (f": the residual{NOT}0.00, and a part of it is slow), "
                                            f"which noise of u does; or it suggests {WHY}")),
     ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
-        f": the residual, 1.00{TIMES}, is not white, that of least squares of the same data is: "
-        "what is left says more of these estimates than of the model")),
+        f": the residual, 1.00{TIMES}, is not white, that of least squares that weigh each output "
+        "by its noise is: what is left says more of these estimates than of the model")),
     ({"slow": True, "rounded": [("y", 0.05)]}, (
         f": the residual{NOT}0.00, and a part of it is slow), which suggests that it is rounding "
         f"(y to steps of 0.05), for which deviations are too small, or {WHY}")),
@@ -351,7 +351,11 @@ def test_what_the_residual_of_a_right_plant_is_coloured_by_is_said():
     noise = np.random.default_rng(2).standard_normal((2, 401))
     right = {"t": made.t, "u": made["u"], "y": made["y"] + 0.05 * noise[0]}
     said = run(plant, data=right, estimator="ls_drem", beta=1.0).verdict
-    assert "the residual is not white, that of least squares of the same data is:" in said
+    assert "not white, that of least squares that weigh each output by its noise is:" in said
+    two = plant | {"outputs": ["y", "z"], "C": [[1], [1]]}
+    seen = right | {"y": made["y"] + 0.02 * noise[0], "z": made["y"] + 0.5 * noise[1]}
+    said = run(two, data=seen, estimator="least_squares").verdict
+    assert "not white, that of least squares that weigh each output by its noise is:" in said
     levels = {"name": "gaussian", "outputs": 0.05, "inputs": 1.0}
     seen = right | {"u": made["u"] + noise[1]}
     assert "which noise of u does; or it suggests" in run(plant, data=seen, noise=levels).verdict

@@ -10,6 +10,7 @@ import numpy as np
 from gpebo_cli.experiment.result import EstimationResult, Fit
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.numerics.linalg import reciprocals
 from gpebo_cli.observers import Observation
 
 _LAGS = 20  # of the residual's autocorrelation
@@ -19,6 +20,7 @@ _FAINT = 1e-3  # of whose past smaller directions than that are their own noise
 _RARE = 0.005  # chance of each sum below which they are not those of white noise
 _SILENT = 1e-9  # of an output: a residual below that is rounding
 _FAR = 7.0  # deviations of most samples: what is farther away is no noise of theirs
+_ROUNDS = 4
 _ROUNDING = 0.35  # steps: rounding alone leaves 0.29
 _ROUNDED = 0.95  # share of an output's changes that are whole steps, if it is rounded to these
 
@@ -42,18 +44,16 @@ def fit_of(
         return float(np.sqrt(regression.misfit(eta) / duration))
 
     changing = bool(regression.resets) or regression.dynamics is not None
-    residual, size = np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p))
+    least = np.nan if changing else rms(regression.least_squares())
+    fit = Fit(np.array([rms(eta) for eta in final]), rms(np.zeros(regression.p)), least)
     if changing:
-        return Fit(residual, size, np.nan)
-    best = regression.least_squares()
-    fit = Fit(residual, size, rms(best))
+        return fit
     found = _explained(fit, final[fit.best], about, system, source)
-    worse = residual[fit.best] > (1.0 + _SILENT) * fit.least
-    if not worse or (found.white is not False and not found.far):
+    if found.white is None or (found.white and not found.far):
         return found
-    # Estimates that forget are farther from the truth than the noise of all data brings them.
-    of_least = _explained(fit, best, about, system, source)
-    return replace(found, least_white=bool(of_least.white and not of_least.far))
+    # Estimates that forget, or that weigh a noisy output as a good one, leave more than noise.
+    again = _explained(fit, final[fit.best], about, system, source, fitted_again=True)
+    return replace(found, least_white=bool(again.white and not again.far))
 
 
 def _varies_slowly(residual: Array) -> bool:
@@ -99,6 +99,17 @@ def _follows(residual: Array, inputs: Array) -> bool:
     return bool(fdtrc(count * r.shape[1], free * r.shape[1], ratio) < _RARE)
 
 
+def _weighed(columns: Array, residual: Array, y: Array) -> Array:
+    """What of columns (N, r, p) fits (N, r) of y best, each output by what is typical of it."""
+    typical = np.median(np.abs(residual), axis=0)
+    weight = reciprocals(typical, typical > _SILENT * np.abs(y).max(axis=0))
+    rows = (columns * weight[:, None]).reshape(-1, columns.shape[2])
+    size = np.linalg.norm(rows, axis=0)
+    scale = reciprocals(size, size > 0.0)
+    found = np.linalg.lstsq(rows * scale, (residual * weight).ravel())
+    return np.asarray(columns @ (scale * found[0]))
+
+
 def _step(y: Array) -> float:
     """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
     change = np.abs(np.diff(y))
@@ -109,18 +120,20 @@ def _step(y: Array) -> float:
 
 
 def _explained(
-    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source
+    fit: Fit, eta: Array, observation: Observation, system: DescriptorSystem, source: Source,
+    *, fitted_again: bool = False,
 ) -> Fit:
     """With ŷ of the final estimates η̂ (p,), and how white y − ŷ is.
 
     ŷ is C x̂ + D u + H θ̂ of a plant, and ψη̂ of a regression whose Y is measured. Whiteness is
-    looked at at every sample, or at the output times if x̂ is known there only.
+    looked at at every sample, or at the output times if x̂ is known there only. Where they are
+    ``fitted_again`` it is that of least squares in which each output counts by its own noise.
     """
     t, recording, state_map = source.t, source.recording, observation.state_map
     if recording is None or len(state_map.times):
         return fit
 
-    def outputs(t: Array, own_t: Array, u: Array, y: Array) -> Array:
+    def outputs(eta: Array, t: Array, own_t: Array, u: Array, y: Array) -> Array:
         if system.regression is not None:
             return np.asarray(observation.regression.psi(t) @ eta)[:, : system.r]
         x = state_map.at(t)(np.broadcast_to(eta, (1, len(t), len(eta))))[0]
@@ -131,7 +144,8 @@ def _explained(
         ))
 
     u, y = recording.inputs, recording.outputs
-    fitted = outputs(t, t if source.own_t is None else source.own_t, u, y)
+    own_t = t if source.own_t is None else source.own_t
+    fitted = outputs(eta, t, own_t, u, y)
     fit = replace(fit, outputs=fitted)
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
@@ -139,7 +153,13 @@ def _explained(
         return fit
     if observation.regression.factor is None and not source.pieces:
         u, y = source.inputs(samples), source.outputs(samples)
-        t, fitted = samples, outputs(samples, samples, u, y)
+        t, own_t, fitted = samples, samples, outputs(eta, samples, samples, u, y)
+    if fitted_again:
+        changes = np.diag(np.abs(eta) + (eta == 0.0))  # none is rounding beside η̂
+        others = [outputs(eta + change, t, own_t, u, y) for change in changes]
+        columns = np.stack(others, axis=-1) - fitted[..., None]
+        for _ in range(_ROUNDS):  # how noisy each output is shows in what is left
+            fitted = fitted + _weighed(columns, y - fitted, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.
     apart = 2.0 * (recording.last - recording.first) / (recording.rows - 1)
     step = float(t[-1] - t[0]) / (len(t) - 1)

@@ -96,7 +96,7 @@ def _explains(fit: Fit, case: int) -> str:
     if residual <= _EXACT * fit.size:
         return ": the estimates explain the data"
     if fit.least_white:
-        of_least = "that of least squares of the same data is"
+        of_least = "that of least squares that weigh each output by its noise is"
         return f": the residual{noise and noise + ','} is not white, {of_least}: {_OF_ESTIMATES}"
     if fit.far:
         told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
