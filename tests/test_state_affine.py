@@ -25,7 +25,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import Measurements
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
-from gpebo_cli.simulation.newton import _refuse_slow, _window, follow
+from gpebo_cli.simulation.newton import _ends, _refuse_slow, _window, follow
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -492,6 +492,20 @@ def test_zero_output_at_the_start_of_a_division_is_refused():
     said = "F[1][0] = '-1/y' has no finite value at t = 0, where initial_state makes y = 0"
     with pytest.raises(ConfigError, match=re.escape(said)):
         simulate(boost(initial_state=[3, 0]), TimeSettings(horizon=1.0), SOLVER)
+
+
+def kinds(of=GpeboError):
+    """All kinds of errors that are raised on purpose."""
+    return {of}.union(*map(kinds, of.__subclasses__()))
+
+
+def test_every_kind_of_error_can_say_where_the_solution_ends():
+    """Such as rounding, where two equations contradict each other along an output."""
+    system = boost()
+    for kind in kinds():
+        found = _ends(system, 0.0, system.initial_state, kind("why"))
+        assert type(found) is kind
+        assert str(found).endswith("cannot be followed beyond t = 0 (v = 18 there): why")
 
 
 def of_motor(t, x):

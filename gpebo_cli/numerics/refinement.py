@@ -32,7 +32,7 @@ Evaluate = Callable[[Mesh, "Found | None", IntArray], tuple[Found, Array]]
 class RoundingError(SolverError):
     """The solver cannot reach the tolerance, for what it ``found`` is rounding in a part."""
 
-    def __init__(self, message: str, found: Any) -> None:
+    def __init__(self, message: str, found: Any = None) -> None:
         super().__init__(message)
         self.found = found
 
