@@ -151,8 +151,11 @@ def _places(rng, k=6, s=5, count=50):
     return edges, rule.points, rule.barycentric, t, t + rng.choice([0.0, 0.01], len(t)), 4.0 * EPS
 
 
-def _model(rng, times=19, n=3, constant=False, turned=False):
-    """E x' = A x of index 2: x1' = … , 0 = x1-like, perhaps turned; and its scales."""
+def _model(rng, times=19, n=3, constant=False, turned=False, steady=False):
+    """E x' = A x of index 2: x1' = … , 0 = x1-like, perhaps turned; and its scales.
+
+    E and A are ``constant``, or E alone is ``steady``.
+    """
     orders, count = 2, 1 if constant else times
     E, A = 0.1 * rng.normal(size=(2, orders, count, n, n))
     E[:, :, -1] = 0.0
@@ -163,6 +166,7 @@ def _model(rng, times=19, n=3, constant=False, turned=False):
     if turned:  # then rows and columns differ in nothing but their numbers
         left, right = np.linalg.qr(rng.normal(size=(2, n, n)))[0]
         E, A = left @ E @ right, left @ A @ right
+    E = E[:, :1] if steady else E
     return E, A, 2.0 ** rng.integers(-2, 3, size=n), 2.0 ** rng.integers(-2, 3, size=n), 0.5, orders
 
 
@@ -272,11 +276,14 @@ CASES: list[tuple[str, str, Case]] = [
     ("structure", "reference", partial(_start, n=4, turned=True)),
     ("structure", "levels", _levels),
     ("structure", "levels", partial(_levels, constraints=2, times=2)),
+    ("structure", "levels", partial(_levels, steady=True)),
     ("structure", "bounds", _bounds),
     ("structure", "bounds", partial(_bounds, n=5, times=1)),
+    ("structure", "bounds", partial(_bounds, steady=True)),
     ("structure", "eliminated", _eliminated),
     ("structure", "eliminated", partial(_eliminated, n=6, q=0)),
     ("structure", "eliminated", partial(_eliminated, times=9, constant=True)),
+    ("structure", "eliminated", partial(_eliminated, steady=True)),
     *(("elements", "element_maps", partial(_equation, **options)) for options in (
         {}, {"identity": True}, {"constrained": True}, {"constant": True},
         {"constant": True, "constrained": True}, {"constant": True, "identity": True},
