@@ -269,26 +269,26 @@ def test_the_evidence_of_a_state_that_decays_is_in_closed_form():
     assert found["Growth of Φ"] == {"largest_entry": 1.0, "rate": pytest.approx(-1.0)}
 
 
-def test_the_evidence_of_an_algebraic_state_is_in_closed_form():
-    """x' = −x, 0 = x − z, y = c z with c = 1 + (t − 1)²: z is seen least at t = 1."""
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e-4])
+def test_the_evidence_of_an_algebraic_state_is_in_closed_form(unit):
+    """x' = −x, 0 = x − z, y = x, v = c z with c = 1 + (t − 1)²: z is seen least at t = 1."""
     found = evidence(one_state(
-        states=["x", "z"], E=[[1, 0], [0, 0]], A=[[-1, 0], [1, -1]], C=[[0, "1 + (t - 1)**2"]],
-        initial_state=[1, 5],
-    ), horizon=3.0)
+        states=["x", "z"], E=[[1, 0], [0, 0]], A=[[-1, 0], [1, -1]], outputs=["y", "v"],
+        C=[[1, 0], [0, f"{unit}*(1 + (t - 1)**2)"]], initial_state=[1, 5],
+    ), horizon=2.0)
     assert found["Solvability"]["index"] == found["Solvability"]["a"] == 1
     assert found["Consistent start"] == {"largest_change": pytest.approx(4.0)}
     assert found["Rank of E"] == {"rank": 1, "states": 2}
-    # (−1, c) is what the kernel of E has in [[1, −1], [0, c]].
+    # (−1, 0, c) is what the kernel of E has in [[1, −1], [1, 0], [0, c]].
     assert found["Assumption 1"] == {
-        "smallest_singular_value": pytest.approx(np.sqrt(2.0 / 3.0), abs=1e-3),
-        "at": pytest.approx(1.0, abs=0.05), "form": "given",
+        "smallest_singular_value": pytest.approx(np.sqrt(2.0 / 4.0), rel=1e-9),
+        "at": pytest.approx(1.0), "form": "given",
     }
 
     def square(t):
-        """Of what (1, 0) e^−t has at right angles to that."""
-        c = 1.0 + (t - 1.0) ** 2
-        return np.exp(-2.0 * t) * c**2 / (1.0 + c**2)
+        """Of what (1, 1, 0) e^−t has at right angles to that."""
+        return np.exp(-2.0 * t) * (2.0 - 1.0 / (1.0 + (1.0 + (t - 1.0) ** 2) ** 2))
 
     of_psi = found["Assumption 2"]["lambda_min"]
-    assert of_psi == pytest.approx(quad(square, 0.0, 3.0, epsabs=1e-12)[0], rel=1e-9)
+    assert of_psi == pytest.approx(quad(square, 0.0, 2.0, epsabs=1e-12)[0], rel=1e-9)
     assert found["Growth of Φ"] == {"largest_entry": 1.0, "rate": pytest.approx(-1.0)}
