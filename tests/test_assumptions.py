@@ -10,6 +10,7 @@ import pytest
 from examples import gpebo
 from plants import one_state, reference, shipped
 from processes import printed
+from scipy.integrate import quad
 
 from gpebo_cli import run
 from gpebo_cli.experiment.assumptions import examine, warnings
@@ -245,3 +246,52 @@ def test_a_state_that_no_equation_sees_is_none_in_other_coordinates_either(seed,
     )
     names = {a.name: a for a in examine(settings, plant_from_mapping(plant, "mixed")).assumptions}
     assert names["Assumption 1"].holds == bool(seen)
+
+
+def evidence(plant, **time):
+    """By names of assumptions, after a run with five samples."""
+    details = run(plant, time={"samples": 5, **time}).details
+    return {a.name: a.evidence for a in details.assumptions}
+
+
+def test_the_evidence_of_a_state_that_decays_is_in_closed_form():
+    """ψ = e^(2 − t) from t = 2 on, for one second."""
+    found = evidence(one_state(A=[[-1]]), start=2.0, horizon=1.0)
+    one = {"strangeness_index": 0, "index": 0, "d": 1, "a": 0, "smallest_singular_value": 1.0}
+    assert found["Solvability"] == {**one, "bounded_between_nodes": True}
+    assert found["Consistent start"] == {"largest_change": 0.0}
+    assert found["Rank of E"] == {"rank": 1, "states": 1}
+    # Nothing is algebraic: what is told of the start is told of all times.
+    assert found["Assumption 1"] == {
+        "smallest_singular_value": np.inf, "at": 2.0, "form": "given"}
+    assert found["Assumption 2"] == {
+        "psi_depends_on": "time alone", "t_c": 2.0, "weakest_direction": "+1 e0_x",
+        "normalised_min": pytest.approx(1.0), "condition": pytest.approx(1.0),
+        "lambda_min": pytest.approx((1.0 - np.exp(-2.0)) / 2.0, rel=1e-9),
+    }
+    assert found["Growth of Φ"] == {"largest_entry": 1.0, "rate": pytest.approx(-1.0)}
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e-4])
+def test_the_evidence_of_an_algebraic_state_is_in_closed_form(unit):
+    """x' = −x, 0 = x − z, y = x, v = c z with c = 1 + (t − 1)²: z is seen least at t = 1."""
+    found = evidence(one_state(
+        states=["x", "z"], E=[[1, 0], [0, 0]], A=[[-1, 0], [1, -1]], outputs=["y", "v"],
+        C=[[1, 0], [0, f"{unit}*(1 + (t - 1)**2)"]], initial_state=[1, 5],
+    ), horizon=2.0)
+    assert found["Solvability"]["index"] == found["Solvability"]["a"] == 1
+    assert found["Consistent start"] == {"largest_change": pytest.approx(4.0)}
+    assert found["Rank of E"] == {"rank": 1, "states": 2}
+    # (−1, 0, c) is what the kernel of E has in [[1, −1], [1, 0], [0, c]].
+    assert found["Assumption 1"] == {
+        "smallest_singular_value": pytest.approx(np.sqrt(2.0 / 4.0), rel=1e-9),
+        "at": pytest.approx(1.0), "form": "given",
+    }
+
+    def square(t):
+        """Of what (1, 1, 0) e^−t has at right angles to that."""
+        return np.exp(-2.0 * t) * (2.0 - 1.0 / (1.0 + (1.0 + (t - 1.0) ** 2) ** 2))
+
+    of_psi = found["Assumption 2"]["lambda_min"]
+    assert of_psi == pytest.approx(quad(square, 0.0, 2.0, epsabs=1e-12)[0], rel=1e-9)
+    assert found["Growth of Φ"] == {"largest_entry": 1.0, "rate": pytest.approx(-1.0)}

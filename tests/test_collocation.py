@@ -569,6 +569,18 @@ def test_signals_in_units_are_as_well_resolved_as_without():
     np.testing.assert_allclose(found, unresolved(waves, rule), rtol=1e-9)
 
 
+@pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])
+def test_elements_are_of_one_length_in_any_unit_of_time(unit):
+    """Those that differ by rounding of times are, whatever lies between them."""
+    steps = np.array([0.5, 0.25, 0.5, 0.25 + 1e-9, 0.5 + 2e-16])
+    edges = np.concatenate([[0.0], steps.cumsum()])
+    (one, means), (other, others) = (
+        equal_lengths(by * steps, Mesh(by * edges, radau_rule(3))) for by in (1.0, unit)
+    )
+    assert one.tolist() == other.tolist() == [0, 1, 0, 2, 0]
+    np.testing.assert_array_equal(others, unit * means)
+
+
 @pytest.mark.parametrize("unit", [1e-8, 1e8])
 def test_sizes_and_tails_are_in_proportion_to_the_signals(unit):
     """A component below a thousandth of the largest one is measured by that."""
@@ -652,6 +664,12 @@ def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
         np.testing.assert_allclose(errors.last, column(3e-9, 1e-9, 0.0))
         assert errors.estimate == pytest.approx((errors.largest / size).max(), rel=1e-12)
         assert errors.lost == 2
+        small = judged_errors(
+            replace(problem, floor=1e-6 * problem.floor), 1e-6 * carried,
+            *(1e-6 * part for part in parts),
+        )
+        np.testing.assert_allclose(small.relative, errors.relative, rtol=1e-9)
+        assert small.estimate == pytest.approx(errors.estimate, rel=1e-9)
         few = judged_errors(problem, carried, parts[0] + 1.0, *parts[1:])
         assert few.estimate == pytest.approx((few.largest / beside).max(), rel=1e-12)
 

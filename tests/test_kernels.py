@@ -87,7 +87,7 @@ def _maps(rng, k=7, s=4, n=3, c=2, one=False):
     )
 
 
-def _carried(rng, k=6, s=5, n=3, c=2, constant=False, still=False):
+def _carried(rng, k=6, s=5, n=3, c=2, constant=False, still=False, unit=1.0):
     rule, maps = radau_rule(s), 1 if constant else k
     noise = rng.uniform(size=(1, n, n + c)) * np.ones((k, 1, 1)) if constant else (
         rng.uniform(size=(k, n, n + c))
@@ -97,13 +97,15 @@ def _carried(rng, k=6, s=5, n=3, c=2, constant=False, still=False):
     values[:, :, :: 1 if still else n, :: 1 if still else c] = 0.0  # rounding alone is left
     used = min(4, s - 1)
     return (
-        values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
-        rng.normal(size=(maps, n, n)), rng.normal(size=(k, n, c)), noise,
+        unit * values, rule.to_legendre, (s + 1) / np.arange(s + 1 - used, s + 1),
+        rng.normal(size=(maps, n, n)), unit * rng.normal(size=(k, n, c)), noise,
         rng.choice([-1.0, 1.0], size=(k + 1, n, 6)), 0.3, 8.0, np.inf if constant else 4.0,
     )
 
 
-def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most=4, degrees=3):
+def _series(
+    rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most=4, degrees=3, unit=1.0,
+):
     """x' = A x + f with a third of the entries, none of them in one row."""
     i, j = np.nonzero(rng.uniform(size=(d, d)) < 0.35 * (np.arange(d) != 1)[:, None])
     parts = rng.integers(1, most, size=k)
@@ -114,8 +116,8 @@ def _series(rng, k=5, s=4, d=6, c=2, constant=False, forced=1, kicked=True, most
         np.searchsorted(i, np.arange(d + 1)), j,
         rng.normal(size=(count, len(i), degrees)) * there[:, None] / degrees,
         1.0 * np.maximum.accumulate(there[:, ::-1], axis=1)[:, ::-1],
-        rng.normal(size=(parts.sum(), 2, d, forced)),
-        rng.normal(size=(k, d, c)) if kicked else None, rng.normal(size=(d, c)),
+        unit * rng.normal(size=(parts.sum(), 2, d, forced)),
+        unit * rng.normal(size=(k, d, c)) if kicked else None, unit * rng.normal(size=(d, c)),
         np.exp(rng.normal(size=d)), 1e-15, 1e-3,
     )
 
@@ -151,8 +153,11 @@ def _places(rng, k=6, s=5, count=50):
     return edges, rule.points, rule.barycentric, t, t + rng.choice([0.0, 0.01], len(t)), 4.0 * EPS
 
 
-def _model(rng, times=19, n=3, constant=False, turned=False):
-    """E x' = A x of index 2: x1' = … , 0 = x1-like, perhaps turned; and its scales."""
+def _model(rng, times=19, n=3, constant=False, turned=False, steady=False):
+    """E x' = A x of index 2: x1' = … , 0 = x1-like, perhaps turned; and its scales.
+
+    E and A are ``constant``, or E alone is ``steady``.
+    """
     orders, count = 2, 1 if constant else times
     E, A = 0.1 * rng.normal(size=(2, orders, count, n, n))
     E[:, :, -1] = 0.0
@@ -163,6 +168,7 @@ def _model(rng, times=19, n=3, constant=False, turned=False):
     if turned:  # then rows and columns differ in nothing but their numbers
         left, right = np.linalg.qr(rng.normal(size=(2, n, n)))[0]
         E, A = left @ E @ right, left @ A @ right
+    E = E[:, :1] if steady else E
     return E, A, 2.0 ** rng.integers(-2, 3, size=n), 2.0 ** rng.integers(-2, 3, size=n), 0.5, orders
 
 
@@ -246,13 +252,13 @@ def _by_steps(E, A, B, F, C, rows, scale, domain, range_, kernel, equations):
     )
 
 
-def _regression(rng, times=11, n=4, k=2, q=1, rows=3, b=2, one=False, axes=None):
+def _regression(rng, times=11, n=4, k=2, q=1, rows=3, b=2, one=False, axes=None, unit=1.0):
     of_time = 1 if one else times
     basis = rng.normal(size=(n, k)) if axes is None else np.eye(n)[:, axes]
     return (
-        rng.normal(size=(times, k, 1 + q + k)), q, basis,
-        rng.normal(size=(of_time, rows, k)), rng.normal(size=(times, rows)),
-        rng.normal(size=(of_time, rows, q)),
+        unit * rng.normal(size=(times, k, 1 + q + k)), q, basis,
+        rng.normal(size=(of_time, rows, k)), unit * rng.normal(size=(times, rows)),
+        unit * rng.normal(size=(of_time, rows, q)),
         np.linalg.qr(rng.normal(size=(of_time, rows, b)))[0], rng.normal(size=(of_time, n, b)),
     )
 
@@ -265,18 +271,21 @@ CASES: list[tuple[str, str, Case]] = [
     ("observer", "in_frame", partial(_in_frame, n=6, r=3)),
     ("observer", "regression_signals", _regression),
     ("observer", "regression_signals", partial(_regression, q=0, one=True)),
-    ("observer", "regression_signals", partial(_regression, axes=[1, 2])),
+    ("observer", "regression_signals", partial(_regression, axes=[1, 2], unit=1e-6)),
     ("observer", "regression_signals", partial(_regression, q=2, axes=[0, 3])),
     ("structure", "reference", _start),
     ("structure", "reference", partial(_start, n=5)),
     ("structure", "reference", partial(_start, n=4, turned=True)),
     ("structure", "levels", _levels),
     ("structure", "levels", partial(_levels, constraints=2, times=2)),
+    ("structure", "levels", partial(_levels, steady=True)),
     ("structure", "bounds", _bounds),
     ("structure", "bounds", partial(_bounds, n=5, times=1)),
+    ("structure", "bounds", partial(_bounds, steady=True)),
     ("structure", "eliminated", _eliminated),
     ("structure", "eliminated", partial(_eliminated, n=6, q=0)),
     ("structure", "eliminated", partial(_eliminated, times=9, constant=True)),
+    ("structure", "eliminated", partial(_eliminated, steady=True)),
     *(("elements", "element_maps", partial(_equation, **options)) for options in (
         {}, {"identity": True}, {"constrained": True}, {"constant": True},
         {"constant": True, "constrained": True}, {"constant": True, "identity": True},
@@ -287,12 +296,12 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
     *(("elements", "carried_errors", partial(_carried, **options)) for options in (
         {}, {"k": 2}, {"k": 9, "constant": True}, {"k": 1, "s": 2, "n": 1, "c": 1},
-        {"s": 14, "n": 5}, {"still": True},
+        {"s": 14, "n": 5}, {"still": True}, {"unit": 1e-6},
     )),
     *(("elements", "series", partial(_series, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},
         {"k": 1, "d": 1, "c": 3, "forced": 3}, {"c": 17}, {"most": 9},
-        {"c": 1, "degrees": 6, "s": 14}, {"c": 1, "constant": True, "forced": 0},
+        {"c": 1, "degrees": 6, "s": 14}, {"c": 1, "constant": True, "forced": 0}, {"unit": 1e-6},
     )),
     *(("elements", "stiff", partial(_stiff, **options)) for options in (
         {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},
@@ -300,7 +309,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),
-    ("signals", "largest", lambda rng: (rng.normal(size=(4, 7, 21)),)),
+    ("signals", "largest", lambda rng: (1e-3 * rng.normal(size=(4, 7, 21)),)),
     ("signals", "largest", lambda rng: (np.swapaxes(rng.normal(size=(3, 2, 30)), 0, 1),)),
     ("signals", "sample", _samples),
     ("signals", "sample", partial(_samples, c=33)),

@@ -248,6 +248,20 @@ def test_errors_are_not_larger_than_they_are_said_to_be(build):
         assert (off <= 10.0 * found.state_errors * np.abs(true).max(axis=0)).all()
 
 
+def test_a_state_that_cancels_is_measured_by_what_it_is_made_of():
+    """a and b are the same and c = a − b is none; e = a + b counts by its own size."""
+    system = load_plant({
+        "name": "alike", "states": list("abce"), "inputs": {"u": "1 + sin(t)"},
+        "E": np.diag([1.0, 1.0, 0.0, 0.0]).tolist(), "B": [[1], [1], [0], [0]],
+        "A": [[-1, 0, 0, 0], [0, -1, 0, 0], [1, -1, -1, 0], [1, 1, 0, -1]],
+        "initial_state": [0.3, 0.3, 0.0, 0.6],
+    })
+    found = large.large_simulation(system, TIME, SolverSettings(tol=1e-9))
+    assert np.abs(found.signals.states.values[..., 2]).max() < 1e-15
+    assert 0.0 < found.state_errors[2] < 1e-8
+    assert found.state_errors[2:] == pytest.approx(found.state_errors[:2].max(), rel=0.5)
+
+
 def test_a_state_that_an_input_gives_is_as_wrong_as_polynomials_leave_it():
     """x0 = u: nothing is integrated for it."""
     system = plant(source_on_a_node, u="exp(-((t - 4)/0.3)**2)")

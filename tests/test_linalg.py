@@ -15,9 +15,11 @@ from gpebo_cli.numerics.linalg import (
     affine_scan,
     determinant_and_adjugate_action,
     determinant_and_inverse,
+    exact_product,
     inverse_or_none,
     largest_over_time,
     products_of_others,
+    without_rounding,
 )
 from gpebo_cli.reduction.scaling import _first_of_each_part
 
@@ -76,7 +78,7 @@ def test_affine_scan_of_nothing_is_the_start():
 
 @pytest.mark.parametrize("shape", [(0, 3), (1, 2), (525, 4, 3), (64, 0), (300, 1), (70, 20, 20)])
 def test_the_largest_sizes_over_time_are_those_of_the_times_one_by_one(shape):
-    values = np.random.default_rng(0).normal(size=shape)
+    values = 1e-3 * np.random.default_rng(0).normal(size=shape)
     expected = np.array([np.abs(one) for one in values]).reshape(shape).max(axis=0, initial=0.0)
     assert np.array_equal(largest_over_time(values), expected)
     assert np.array_equal(largest_over_time(values[None].swapaxes(0, 1), 2), expected)
@@ -110,3 +112,18 @@ def test_products_of_others_are_those_without_one():
     found = products_of_others(factors)
     for i in range(5):
         np.testing.assert_allclose(found[..., i], np.delete(factors, i, axis=-1).prod(axis=-1))
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_what_counts_as_rounding_is_in_proportion_to_the_terms(unit):
+    """1e-14 of the largest entry or of its own terms; in a row, of what chooses."""
+    found = unit * np.array([[[1.0, 1e-14], [1e-12, 0.5]], [[0.0, 1e-14], [1e-12, 0.5]]])
+    kept = found * np.array([[1, 0], [1, 1]])
+    np.testing.assert_array_equal(without_rounding(found.copy()), kept)
+    terms = unit * np.array([[[1.0, 1e-14], [100.0, 1.0]]])
+    np.testing.assert_array_equal(
+        without_rounding(found.copy(), terms), found * np.array([[1, 1], [0, 1]])
+    )
+    left, right = np.array([[[1.0, 1.0], [1e-3, 0.0]]]), np.array([[[1.0], [-1.0 + 1e-14]]])
+    product = exact_product(unit * left, unit * right)
+    np.testing.assert_allclose(product, unit**2 * np.array([[[0.0], [1e-3]]]), rtol=1e-12)

@@ -16,6 +16,7 @@ from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 from test_remedies import MIXED
+from units import Units, in_units
 
 import gpebo_cli
 from gpebo_cli import estimators
@@ -231,6 +232,22 @@ def test_it_does_not_matter_how_samples_are_grouped():
         for field in ("growth", "growth_rate"):
             assert getattr(parts, field) == pytest.approx(getattr(at_once, field), rel=1e-6)
         assert parts.assumptions == at_once.assumptions
+
+
+def test_sizes_of_terms_have_no_sign_where_a_kernel_turns():
+    plant = {**ROTATING, "initial_state": dict(zip(
+        ROTATING["states"], ROTATING["initial_state"], strict=True))}
+    t, sizes = np.linspace(0.0, 2.0, 21), []
+    for signs in ([1, 1, 1, 1], [1, -1, -1, 1]):
+        one = np.ones(1)
+        units = Units(np.array(signs), one, one, one, np.ones(4), 1.0)
+        system = plant_from_mapping(in_units(plant, units))
+        u, y = signals(system, t)
+        made = build({"name": "gpebo"}).at_samples(
+            system, SolverSettings(), "linear", t[0], np.append(u[0], y[0]), None
+        )
+        sizes.append(made.advance(None, t, u, y)[1].regression.scale)
+    np.testing.assert_allclose(*sizes, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["descriptor", "rotating", "mixed"])

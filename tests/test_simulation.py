@@ -24,6 +24,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
+from gpebo_cli.simulation.known import known_resolved
 from gpebo_cli.simulation.large import dense_structure
 from gpebo_cli.simulation.simulate import _growth_resolved, simulate
 
@@ -758,3 +759,28 @@ def test_a_restart_from_what_is_no_number_is_refused_with_its_time():
     restarts = {0.5: lambda x: x, 1.5: lambda x: np.inf * x}
     with refused("the law is beyond all numbers at t = 1.5", by=GpeboError):
         by_the_independent_path(-1.0, [0.0, 0.5, 1.5, 2.0], restarts=restarts)
+
+
+def test_known_functions_are_looked_at_evenly_within_each_element():
+    """Before the start and beyond the end there may be nothing to look at."""
+    system = plant(states=["x"], E=[[1]], A=[[-1]], B=[[1]], inputs={"u": "sin(t)"},
+                   initial_state=[0])
+    meshes, seen = [], []
+
+    def evaluated(mesh):
+        meshes.append(mesh)
+        return system.coefficients.taylor(mesh.points.ravel(), 0)
+
+    def looked_at(t):
+        seen.append((t, meshes[-1]))
+        return system.coefficients.taylor(t, 0)
+
+    mesh = Mesh(np.array([1.0, 2.0, 4.0]), radau_rule(9))
+    known_resolved(
+        system, evaluated, looked_at, mesh, evaluated(mesh), np.ones(1), SOLVER, bounded=False
+    )
+    (t, mesh), = seen
+    place = (t.reshape(mesh.size, -1) - mesh.edges[:-1, None]) / mesh.steps[:, None]
+    looks = place.shape[1]
+    expected = (np.arange(looks) + 0.5) / looks
+    np.testing.assert_allclose(place, np.tile(expected, (mesh.size, 1)), rtol=1e-6)

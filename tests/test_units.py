@@ -16,6 +16,7 @@ from gpebo_cli.evidence.excitation import WELL
 from gpebo_cli.experiment.sensors import candidates
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.regression.resets import level_of
 from gpebo_cli.settings import Settings, TimeSettings
 
 SHIPPED = sorted(
@@ -282,6 +283,17 @@ def test_least_squares_keeps_its_digits_in_any_units(name):
     estimator = estimators.build({"name": name, "f0": 1e-200, **more})
     found = estimator.estimate(regression, np.array([0.0, 2.0])).parameters(slice(None))[0, -1]
     assert found * unit == pytest.approx(truth, rel=1e-9)
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_a_regression_of_functions_and_its_data_have_sizes_in_their_units(unit):
+    regression = LinearRegression.from_functions(
+        lambda t: unit * np.stack([np.cos(t), -0.5 + 0.0 * t], axis=-1)[..., None, :],
+        lambda t: 0.0 * t[..., None], ["a", "b"], np.pi,
+    )
+    assert regression.scale == pytest.approx(unit)
+    ends = [np.pi / 2.0 * unit**2, np.pi / 4.0 * unit**2]
+    np.testing.assert_allclose(level_of(regression.gram.values), ends, rtol=1e-9)
 
 
 def ladder(ampere):
