@@ -236,23 +236,25 @@ def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance
     {"name": "gradient", "gamma": 1e3}, {"name": "ls_drem"}, {"name": "ls_drem", "gamma": 1e4},
     {"name": "drem", "gamma": [1e2, 1e6]}, {"name": "mre"}, {"name": "lion"},
     {"name": "fct", "gamma": 1e4}, {"name": "fct", "extension": "least_squares"},
-    {"name": "power", "gamma": 10.0}, {"name": "exciting", "kappa": 1e3},
+    {"name": "power", "gamma": 10.0, "gamma2": 0.0}, {"name": "exciting", "kappa": 1e3},
+    {"name": "power", "gamma": 10.0, "gamma2": 1e3},
     {"name": "instrumental", "gamma": 1e3}, {"name": "annihilator", "perturbed": ["p1"]},
 ], ids=str)
 def test_estimates_follow_the_sign_and_the_unit_of_what_is_measured(given):
-    """To the last digit, elements, too: −Y and 2³⁰ Y make −η̂ and 2³⁰ η̂ of estimates from 0."""
-    built, units = estimators.build(given), [1.0, -1.0, 2.0**30, -(2.0**-30)]
-    if given["name"] == "power":  # which is not linear
-        units = units[:2]
-    plain, *others = (
-        built.estimate(
-            regression(three, unit * np.abs(ETA), disturbance=lambda t, by=unit: by * wobble(t)), T
-        ).parameters(slice(None)) / unit
-        for unit in units
-    )
-    for other in others:
-        digits = 1e-9 if given["name"] == "exciting" else 0.0
-        np.testing.assert_allclose(other, plain, rtol=0.0, atol=digits)
+    """To the last digit: −Y and 2³⁰ Y make −η̂ and 2³⁰ η̂ of estimates from 0, on equal elements.
+
+    The residual's powers 1/2 and 3/2 want other gains.
+    """
+    found, power = [], given["name"] == "power"
+    for unit in (1.0, -(2.0**30)) if power else (1.0, -1.0, 2.0**30, -(2.0**-30)):
+        made = regression(three, unit * np.abs(ETA), disturbance=lambda t, by=unit: by * wobble(t))
+        own, root = dict(given), abs(unit) ** 0.5
+        if power:
+            own |= {"gamma": given["gamma"] * root, "gamma2": given["gamma2"] / root}
+        found.append(estimators.build(own).estimate(made, T).parameters(slice(None)) / unit)
+    for other in found[1:]:
+        digits = 1e-9 if power or given["name"] == "exciting" else 0.0
+        np.testing.assert_allclose(other, found[0], rtol=0.0, atol=digits)
 
 
 def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
