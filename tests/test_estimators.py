@@ -231,7 +231,7 @@ def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance
     assert np.abs(found - expected).max() < tolerance
 
 
-@pytest.mark.parametrize("given", [
+FROM_ZERO = [
     {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "gradient"},
     {"name": "gradient", "gamma": 1e3}, {"name": "ls_drem"}, {"name": "ls_drem", "gamma": 1e4},
     {"name": "drem", "gamma": [1e2, 1e6]}, {"name": "mre"}, {"name": "lion"},
@@ -239,7 +239,10 @@ def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance
     {"name": "power", "gamma": 10.0, "gamma2": 0.0}, {"name": "exciting", "kappa": 1e3},
     {"name": "power", "gamma": 10.0, "gamma2": 1e3},
     {"name": "instrumental", "gamma": 1e3}, {"name": "annihilator", "perturbed": ["p1"]},
-], ids=str)
+]
+
+
+@pytest.mark.parametrize("given", FROM_ZERO, ids=str)
 def test_estimates_follow_the_sign_and_the_unit_of_what_is_measured(given):
     """To the last digit: −Y and 2³⁰ Y make −η̂ and 2³⁰ η̂ of estimates from 0, on equal elements.
 
