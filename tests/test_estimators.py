@@ -242,6 +242,35 @@ def test_a_row_that_no_parameter_is_in_changes_no_estimate(name):
     np.testing.assert_allclose(run(name, known), run(name, NOISY), rtol=1e-9, atol=1e-12)
 
 
+FROM_ZERO = [
+    {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3}, {"name": "gradient"},
+    {"name": "gradient", "gamma": 1e3}, {"name": "ls_drem"}, {"name": "ls_drem", "gamma": 1e4},
+    {"name": "drem", "gamma": [1e2, 1e6]}, {"name": "mre"}, {"name": "lion"},
+    {"name": "fct", "gamma": 1e4}, {"name": "fct", "extension": "least_squares"},
+    {"name": "power", "gamma": 10.0, "gamma2": 0.0}, {"name": "exciting", "kappa": 1e3},
+    {"name": "power", "gamma": 10.0, "gamma2": 1e3},
+    {"name": "instrumental", "gamma": 1e3}, {"name": "annihilator", "perturbed": ["p1"]},
+]
+
+
+@pytest.mark.parametrize("given", FROM_ZERO, ids=str)
+def test_estimates_follow_the_sign_and_the_unit_of_what_is_measured(given):
+    """To the last digit: −Y and 2³⁰ Y make −η̂ and 2³⁰ η̂ of estimates from 0, on equal elements.
+
+    The residual's powers 1/2 and 3/2 want other gains.
+    """
+    found, power = [], given["name"] == "power"
+    for unit in (1.0, -(2.0**30)) if power else (1.0, -1.0, 2.0**30, -(2.0**-30)):
+        made = regression(three, unit * np.abs(ETA), disturbance=lambda t, by=unit: by * wobble(t))
+        own, root = dict(given), abs(unit) ** 0.5
+        if power:
+            own |= {"gamma": given["gamma"] * root, "gamma2": given["gamma2"] / root}
+        found.append(estimators.build(own).estimate(made, T).parameters(slice(None)) / unit)
+    for other in found[1:]:
+        digits = 1e-9 if power or given["name"] == "exciting" else 0.0
+        np.testing.assert_allclose(other, found[0], rtol=0.0, atol=digits)
+
+
 def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
     """‖F‖ of what is not excited is logistic, and z = 1/(f₀‖F‖) its reciprocal."""
     row, f0, bound = np.array([0.6, 0.8]), 1e-4, 1e6
@@ -599,20 +628,24 @@ def test_many_rows_of_rough_data(name):
     np.testing.assert_allclose(final, ETA, atol=0.02)
 
 
-@pytest.mark.parametrize("name", ["drem", "lion", "ls_drem", "fct", "power"])
-def test_a_gain_that_is_auto_settles_before_the_end(name):
-    built = estimators.tuned(estimators.build({"name": name, "gamma": "auto"}), CLEAN)
+@pytest.mark.parametrize(("name", "size"), [
+    ("drem", 1.0), ("drem", 0.3), ("lion", 1.0), ("ls_drem", 1.0), ("fct", 1.0), ("fct", 0.3),
+    ("power", 1.0),
+])
+def test_a_gain_that_is_auto_settles_before_the_end(name, size):
+    made = regression(lambda t: size * three(t), ETA)
+    built = estimators.tuned(estimators.build({"name": name, "gamma": "auto"}), made)
     (case,) = built.cases
-    error = np.linalg.norm(built.estimate(CLEAN, T).parameters(slice(None))[0] - ETA, axis=1)
+    error = np.linalg.norm(built.estimate(made, T).parameters(slice(None))[0] - ETA, axis=1)
     assert error[-1] < 0.01 * error[0]
-    least = built.estimate(CLEAN, T).requirement.gain
+    least = built.estimate(made, T).requirement.gain
     assert case["gamma"] == pytest.approx(10.0 * least, rel=1e-6)
     # What the text of a gain that is too small says would do, does; half of it does not.
-    said = estimate(name, CLEAN, gamma=least / 100).requirement
+    said = estimate(name, made, gamma=least / 100).requirement
     assert not said.holds
     assert f"γ ≥ {least:.2g}" in said.text
-    assert estimate(name, CLEAN, gamma=1.01 * least).requirement.holds
-    assert not estimate(name, CLEAN, gamma=0.5 * least).requirement.holds
+    assert estimate(name, made, gamma=1.01 * least).requirement.holds
+    assert not estimate(name, made, gamma=0.5 * least).requirement.holds
 
 
 @pytest.mark.parametrize("beta", [0.0, 0.4])

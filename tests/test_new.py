@@ -72,6 +72,9 @@ def test_a_recipe_runs_and_is_drawn(tmp_path):
     assert not list((tmp_path / "drawn").rglob("*circuit*"))  # that is the paper's
     wrong = gpebo("figures", "two_gain", "--config-dir", ".", cwd=tmp_path)
     assert "did you mean two_gains?" in wrong.stderr
+    path.write_text(path.read_text().replace("horizon: 2", "horizon: -2"))
+    wrong = gpebo("figures", "two_gains", "--config-dir", ".", cwd=tmp_path)
+    assert_refused(wrong, "two_gains: time.horizon: ")
 
 
 def test_an_installed_estimator_without_its_file_is_said_to_be_one(tmp_path):

@@ -14,6 +14,7 @@ from examples import gpebo
 from plants import experiment, shipped
 from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
+from test_estimators import FROM_ZERO
 from test_observer import ROTATING
 from test_remedies import MIXED
 from units import Units, in_units
@@ -369,6 +370,21 @@ def test_least_squares_at_samples_is_a_batch_solution(hold):
     squares = np.linalg.eigvalsh(np.einsum("kri,krj->ij", rows[..., :3], rows[..., :3]))
     reached = recursion.requirement.evidence["alpha_lambda_min_over_f0"]
     assert reached == pytest.approx(squares[0] / prior**2, rel=1e-9)
+
+
+@pytest.mark.parametrize("given", [one for one in FROM_ZERO if not one.get("gamma2")], ids=str)
+def test_estimates_at_samples_follow_the_sign_and_the_unit_of_what_is_measured(given):
+    """To the last digit, as in continuous time."""
+    block, found = regression(), []
+    for unit in (1.0, -1.0, 2.0**30, -(2.0**-30)):
+        rows, own = block.rows.copy(), {**given}
+        rows[..., -1] *= unit
+        if given["name"] == "power":
+            own["gamma"] *= abs(unit) ** 0.5
+        recursion = estimators.build(own).recursive(["p1", "p2", "p3"])
+        found.append(recursion.update(replace(block, rows=rows)).parameters / unit)
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
 
 
 def test_the_square_root_form_survives_what_normal_equations_do_not():
