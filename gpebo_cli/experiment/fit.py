@@ -106,7 +106,7 @@ def _weighed(columns: Array, residual: Array, y: Array) -> Array:
     rows = (columns * weight[:, None]).reshape(-1, columns.shape[2])
     size = np.linalg.norm(rows, axis=0)
     scale = reciprocals(size, size > 0.0)
-    found = np.linalg.lstsq(rows * scale, (residual * weight).ravel())
+    found = np.linalg.lstsq(rows * scale, (residual * weight).ravel(), rcond=None)
     return np.asarray(columns @ (scale * found[0]))
 
 
