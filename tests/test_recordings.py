@@ -1029,6 +1029,25 @@ def test_many_files_are_estimated_as_well_as_one(tmp_path):
     np.testing.assert_allclose(sigma, least_sigma, rtol=0.2)
 
 
+def test_a_short_recording_beside_a_long_one_leaves_the_noise_as_it_is(tmp_path):
+    """Of the long one no row is kept, and what is kept of it has less noise than a row."""
+    plant = one_state(A=[[-1]], unknowns={"k": 1.0}, F=[[1]])
+    files, noise = [], np.random.default_rng(5)
+    for rows in 1501, 61:
+        t = np.linspace(0.0, 4.0, rows)
+        y = 1.0 + np.exp(-t) + 0.1 * noise.standard_normal(rows)
+        files.append(write_table(tmp_path / f"{rows}.csv", {"t": t, "y": y}))
+    levels = {"name": "gaussian", "outputs": 0.1}
+    told, found = (
+        run(plant, data=files, time={"samples": 31}, **more).details
+        for more in ({"noise": levels}, {})
+    )
+    assert told.fit.ratio == pytest.approx(1.0, abs=0.05)
+    assert told.fit.white
+    sigma = [each.estimation.parameters_std[0, -1] for each in (told, found)]
+    np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.05)
+
+
 @pytest.mark.parametrize("time", [{"start": 1.96}, {"start": 0.0, "horizon": 0.03}])
 def test_a_span_with_one_row_has_no_residual_to_look_at(time):
     t = np.linspace(0.0, 2.0, 21)

@@ -161,7 +161,8 @@ def _explained(
         for _ in range(_ROUNDS):  # how noisy each output is shows in what is left
             fitted = fitted + _weighed(columns, y - fitted, y)
     # Two samples apart: between samples the signals are interpolated and no noise is white.
-    apart = 2.0 * (recording.last - recording.first) / (recording.rows - 1)
+    pieces = [piece.recording for piece in source.pieces if piece.recording] or [recording]
+    apart = 2.0 * max((each.last - each.first) / (each.rows - 1) for each in pieces)
     step = float(t[-1] - t[0]) / (len(t) - 1)
     stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]

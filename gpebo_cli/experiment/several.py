@@ -17,6 +17,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.sources import Source
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.linalg import triangular
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, joined
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.errors import ErrorSystem, one_after_another
@@ -90,7 +91,8 @@ def joined_observation(
         name if not k else f"{name}_{k + 1}"
         for k, each in enumerate(regressions) for name in each.parameters[q:]
     ]
-    factors = [each.factor for each in regressions if each.factor is not None]
+    condensed = any(each.factor is not None for each in regressions)
+    factors = list(map(_factor, regressions, sources)) if condensed else []
     rows = max(each.psi.values.shape[2] for each in regressions)
     psi = _joined([
         Trajectory(each.mesh, wide(_filled(each.psi.values, rows), k))
@@ -128,7 +130,7 @@ def joined_observation(
             factor=np.concatenate([
                 np.column_stack([wide(factor[:, :-1], k), factor[:, -1]])
                 for k, factor in enumerate(factors)
-            ]) if len(factors) == len(regressions) else None,
+            ]) if condensed else None,
             since=float(starts[-1]),
         ),
         state_map=AffineStateMap(
@@ -159,9 +161,20 @@ def _weakest(
     def margin(a: Assumption) -> tuple[bool, float]:
         return a.holds, float(a.evidence.get("smallest_singular_value") or 0.0)
 
-    return tuple(
-        min(map(moved, each, shifts), key=margin) for each in zip(*found, strict=True)
-    )
+    every = [moved(a, by) for each, by in zip(found, shifts, strict=True) for a in each]
+    names = dict.fromkeys(a.name for a in every)
+    return tuple(min((a for a in every if a.name == name), key=margin) for name in names)
+
+
+def _factor(regression: LinearRegression, source: Source) -> Array:
+    """That of [ψ, Y] of a recording, where another one keeps no more of its rows than this."""
+    if regression.factor is not None or source.samples is None:
+        return regression.root
+    start, stop = regression.mesh.edges[[0, -1]]
+    t = source.samples[(source.samples >= start) & (source.samples <= stop)]
+    rows = np.concatenate([regression.psi(t), regression.Y(t)[..., None]], axis=2)
+    of_rows = triangular([rows.reshape(-1, regression.p + 1)])
+    return np.asarray(np.sqrt((stop - start) / max(len(t), 1)) * of_rows)
 
 
 def _shifts(sources: Sequence[Source]) -> list[float]:
