@@ -56,6 +56,16 @@ def test_operators_may_be_nested_and_multiplied():
     np.testing.assert_allclose(found, [3 * (z[0] - z[1]), z[3]], atol=1e-10)
 
 
+def test_a_column_is_as_well_resolved_in_a_small_unit_as_in_another():
+    """That of b is, beside it."""
+    plain, other = (
+        on_mesh({"unknowns": {"a": 1.0, "b": 2.0}, "signals": {"u": "t"}, "Y": ["u"],
+                 "psi": [[f"{unit}*sin(20*u)", "cos(u)"]]}) for unit in (1.0, 1e-9)
+    )
+    np.testing.assert_array_equal(other.mesh.edges, plain.mesh.edges)
+    np.testing.assert_allclose(other.psi.values, plain.psi.values * [1e-9, 1.0], rtol=1e-12)
+
+
 def test_equal_operators_are_one():
     texts = ["lp(u*u, 2)", "lp(u*v, 2)", "lp(u*u, 2) + lp(lp(u*u, 2), 2)", "hp(u*v, 2)"]
     found = regression_from_mapping({

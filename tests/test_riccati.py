@@ -228,11 +228,16 @@ def test_without_noise_on_the_state_it_is_recursive_least_squares():
     np.testing.assert_allclose(x[0, :, 0], expected, rtol=1e-10)
 
 
-def test_a_constant_that_pushes_hard_takes_no_more_elements():
-    """x' = 10⁶θ: by least squares, P = Ψ (P₀⁻¹ + ∫ΨᵀWΨ)⁻¹ Ψᵀ with Ψ = [1 0; 10⁶t 1]."""
-    push, P0, V, T = 1e6, np.diag([10.0, 10.0]), 1e5, 20.0
+@pytest.mark.parametrize("slow", [1.0, 1e6])
+def test_a_constant_that_pushes_hard_takes_no_more_elements(slow):
+    """x' = 10⁶θ: by least squares, P = Ψ (P₀⁻¹ + ∫ΨᵀWΨ)⁻¹ Ψᵀ with Ψ = [1 0; 10⁶t 1].
+
+    In other units of time, too.
+    """
+    push, P0, V, T = 1e6 / slow, np.diag([10.0, 10.0]), 1e5 * slow, 20.0 * slow
     A, c = np.array([[0.0, 0.0], [push, 0.0]]), np.array([[0.0, 1.0]])
     case = constant(A, c, np.zeros((2, 2)), np.array([[V]]), np.zeros((2, 1)))
+    case = replace(case, z=lambda t: np.array([np.sin(t / slow)]))
     filtered = case.filtered(np.zeros(2), P0, T)
     G = np.array([[push**2 * T**3 / 3, push * T**2 / 2], [push * T**2 / 2, T]]) / V
     reached = np.array([[1.0, 0.0], [push * T, 1.0]])

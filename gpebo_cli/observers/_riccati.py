@@ -240,10 +240,11 @@ def _scaled(
     deviation = np.sqrt(np.diag(P0))
     unit = _units(m.A, deviation, horizon, sizes)
     W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
-    # A common factor of all covariances changes nothing. It is chosen so that W is of order 1:
-    # entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P by nothing
-    # is rounding, and is not made larger.
-    variance = 1.0 / max(float((W * np.outer(unit, unit)).max(initial=0.0)), _UNSEEN / horizon)
+    # A common factor of all covariances changes nothing. It is chosen so that W is of order 1 over
+    # the horizon: entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P
+    # by nothing is rounding, and is not made larger.
+    seen = float((W * np.outer(unit, unit)).max(initial=0.0)) * horizon
+    variance = 1.0 / max(seen, _UNSEEN)
     fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
     if fall > _FALL:
         raise SolverError(
