@@ -267,6 +267,7 @@ def damped(t, since):
         t, [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0], [0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 0.0])),
     ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
+    ("PULSE(0 2 1 0.5 0.25 2)", lambda t: np.interp(t, [1, 1.5, 3.5, 3.75], [0, 2, 2, 0])),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
 ])
 def test_sources_are_those_of_spice(source, expected):

@@ -75,8 +75,10 @@ def test_mistakes_name_the_file(tmp_path):
     done = gpebo("run", "--config-dir", ".", "regression=sine", cwd=tmp_path)
     parts = "regression sine (regression/sine.yaml): ", "psi[0][1]", "lp takes two arguments"
     assert_refused(done, *parts)
-    with pytest.raises(ConfigError, match="stands in place of a plant"):
-        run("circuit", regression=SINE)
+    beside = {"plant": "circuit"}, {"observer": "gpebo"}, {"observer": {"name": "gpebo"}}
+    for given in beside:
+        with pytest.raises(ConfigError, match="stands in place of a plant and an observer"):
+            run(regression=SINE, **given)
 
 
 OPERATORS = {

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from plants import DECAYING
@@ -92,6 +92,7 @@ FORMULAS = ["sin(t)", "max(0, sin(t))", "min(max(u, 0), -(1 + t))", "it's (new)"
 
 
 @settings(deadline=None, max_examples=25)
+@example([("2*t", False), ("a, b", True), ("it's (new)", False)])
 @given(st.lists(st.tuples(st.sampled_from(FORMULAS), st.booleans()), min_size=2, max_size=4))
 def test_formulas_are_swept_whether_or_not_each_of_them_is_quoted(values):
     word = ",".join(quoted(text) if within else text for text, within in values)
