@@ -24,6 +24,7 @@ from gpebo_cli.numerics.linalg import taylor_product, transpose
 
 _EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
+_FAR_BELOW = 1e-30  # of the largest entry
 _SHARE = 0.1  # of a constraint that rounding may be
 _CLEAR = 16.0  # times its rounding, what is smaller is zero
 _DOUBT = 1e3  # times its rounding, what is smaller may be zero
@@ -79,7 +80,9 @@ def in_stages(
             raise UnclearError(place, rounding=bool(near[place]) and not vanish, sudden=sudden)
 
     while True:
-        U, sigma, Vt = np.linalg.svd(E[0])
+        # With entries far below all rounding, LAPACK's iteration may not end.
+        clear = np.abs(E[0]) > _FAR_BELOW * np.abs(E[0]).max(axis=(1, 2), keepdims=True)
+        U, sigma, Vt = np.linalg.svd(np.where(clear, E[0], 0.0))
         relative = sigma / np.maximum(sigma[:, :1], _TINY)
         counts = (relative > np.maximum(rank_tol, _CLEAR * errors.noise)[:, None]).sum(axis=1)
         r, n = int(counts[0]) if ranks is None else (*ranks, len(U[0]))[len(found)], len(U[0])
