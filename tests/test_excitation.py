@@ -8,6 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec, trapezoid
@@ -22,6 +24,7 @@ from gpebo_cli.evidence.excitation import (
 )
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import ExcitationSettings
@@ -115,6 +118,26 @@ def test_t_c_is_no_rounding_of_what_g_grows_to(bend, horizon):
     assert seen.t_c == pytest.approx(found.t_c - 1e6, abs=1e-7)
     first = assess(bent, 1e-5 * np.arange(3.0), ExcitationSettings()).known
     assert (first.margin[1:] < 1.0).all()  # one cannot know there, and it is said
+
+
+@settings(max_examples=10)
+@given(
+    power=st.integers(1, 3), rate=st.floats(0.5, 2.0), bend=st.floats(0.02, 0.5),
+    elements=st.integers(4, 12),
+)
+def test_t_c_does_not_depend_on_the_elements(power, rate, bend, elements):
+    """ψ = tⁿ e^(−rate t) (1, 1 + bend t²): early in an element it is nothing beside its end."""
+    def found(elements):
+        mesh = Mesh(np.linspace(0.0, 8.0, elements + 1), radau_rule(14))
+        t = mesh.points[..., None]
+        both = np.concatenate([np.ones_like(t), 1.0 + bend * t**2], axis=-1)
+        psi = (t**power * np.exp(-rate * t) * both)[..., None, :]
+        made = LinearRegression(
+            Trajectory(mesh, t), Trajectory(mesh, psi), ("a", "b"), np.abs(psi).max(axis=(0, 1, 2))
+        )
+        return assess(made, mesh.edges, ExcitationSettings()).t_c
+
+    assert found(elements) == pytest.approx(found(40), rel=1e-4)
 
 
 def test_what_is_told_apart_from_the_start_on_is_so_at_once():

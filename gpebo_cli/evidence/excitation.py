@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 
 import numpy as np
+from numpy.polynomial import legendre
 
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge
 from gpebo_cli.evidence.metrics import DECAY
@@ -182,7 +183,22 @@ def _t_c(
     return _first_time(
         regression.gram_parts(), regression.mesh.span, judged(smallest, level)[0],
         lambda at, matrices, rounding: judged(*seen(at, matrices, rounding)),
+        None if regression.dynamics else partial(_early, regression),
     )
+
+
+def _early(regression: LinearRegression, t: Array) -> Array:
+    """G (M, p, p) at times t (M,) of the first element, by Gauss's rule.
+
+    Within an element ψᵀψ is resolved beside what it grows to, and of that early ones may be little.
+    """
+    mesh, (places, weights) = regression.mesh, legendre.leggauss(regression.mesh.rule.stages)
+    half = 0.5 * (t - mesh.edges[0])
+    first = Trajectory(Mesh(mesh.edges[:2], mesh.rule), regression.psi.values[:1])
+    psi = first((mesh.edges[0] + half[:, None] * (places + 1.0)).ravel())
+    products = np.swapaxes(psi, 1, 2) @ psi
+    products = products.reshape(len(t), len(places), regression.p, regression.p)
+    return np.asarray(np.einsum("m,n,mnij->mij", half, weights, products))
 
 
 def estimable(
@@ -207,11 +223,13 @@ def since(t: Array, holds: BoolArray) -> list[float | None]:
 def _first_time(
     parts: Iterable[Trajectory], span: tuple[float, float], at_ends: BoolArray,
     reached: Callable[[Array, Array, Array], tuple[BoolArray, BoolArray]],
+    early: Callable[[Array], Array] | None = None,
 ) -> float | None:
     """First time at which something is ``reached``: bracketed on the mesh, then narrowed.
 
     Each round looks at equally many times within the bracket. G is given part by part over a span
-    of time, and ``at_ends`` (K,) is whether it is reached at the right ends of all elements.
+    of time, by ``early`` in the first element, and ``at_ends`` (K,) is whether it is reached at the
+    right ends of all elements.
     """
     if not at_ends.any():
         return None
@@ -224,6 +242,8 @@ def _first_time(
             interpolation_error(part, element, np.tile(rule.points, len(gram))),
         )
         there = there.reshape(points.shape)
+        if early and mesh.edges[0] == span[0]:
+            there[0, :-1] = reached(points[0, :-1], early(points[0, :-1]), np.zeros(()))[0]
         left -= mesh.size
         if left <= 0:
             there[-1, -1] = True
@@ -235,6 +255,8 @@ def _first_time(
     (start, stop), length = span, float(mesh.steps[k])
 
     def looked(at: Array) -> tuple[BoolArray, BoolArray]:
+        if early and mesh.edges[k] == start:
+            return reached(at, early(at), np.zeros(()))
         share, alone = (at - mesh.edges[k]) / length, np.zeros(len(at), dtype=np.intp)
         return reached(at, piece(at), interpolation_error(piece, alone, share))
 
