@@ -196,7 +196,8 @@ def _early(regression: LinearRegression, t: Array) -> Array:
     half = 0.5 * (t - mesh.edges[0])
     first = Trajectory(Mesh(mesh.edges[:2], mesh.rule), regression.psi.values[:1])
     psi = first((mesh.edges[0] + half[:, None] * (places + 1.0)).ravel())
-    products = (np.swapaxes(psi, 1, 2) @ psi).reshape(len(t), len(places), regression.p, -1)
+    products = np.swapaxes(psi, 1, 2) @ psi
+    products = products.reshape(len(t), len(places), regression.p, regression.p)
     return np.asarray(np.einsum("m,n,mnij->mij", half, weights, products))
 
 

@@ -26,7 +26,7 @@ from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.reduction.scaling import Units, units_at
 from gpebo_cli.reduction.strangeness_free import LOOKS, reduced
-from gpebo_cli.reduction.structure import Structure, analyse, who
+from gpebo_cli.reduction.structure import Structure, analyse
 from gpebo_cli.schema import listed
 
 _AHEAD = np.linspace(0.0, 1.0, 17)  # of what of the plant is looked at before its samples come
@@ -268,14 +268,13 @@ def strangeness_free(
         known = replace(system, coefficients=Changed(source, between))
     try:
         structure = analyse(known, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol)
-    except ModelError:
+    except ModelError as error:
         follows = [name for name in system.outputs if name in system.followed]
         if not follows:
             raise
         raise ModelError(
-            f"{who(system)}: observer.form=strangeness_free takes {listed(follows)} as known, and "
-            "with that the plant's equations alone do not determine its states uniquely, or not "
-            "with constant ranks; observer.form=given takes the equations of the outputs, too"
+            f"{error} (observer.form=strangeness_free takes {listed(follows)} as known, and leaves "
+            "out the equations of the outputs, which observer.form=given takes, too)"
         ) from None
     whole = replace(given, structure=structure, derivatives=tuple(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)
