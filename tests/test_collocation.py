@@ -647,7 +647,7 @@ def column(*values):
 
 def test_errors_are_the_sum_of_what_is_known_of_them_in_sizes_of_their_own():
     """Three components: a large one, one that is small beside it, one that rounding makes."""
-    own, made_of, one = column(2.0, 1e-5, 0.0), column(2.0, 1e-5, 0.5), np.ones((3, 1))
+    own, made_of, one = column(2.0, 1e-5, 0.0), column(2.0, 1e-3, 0.5), np.ones((3, 1))
     carried = np.array([[[1e-9], [2e-9], [0.0]], [[3e-9], [1e-9], [0.0]]])
     parts = carried.max(axis=0), column(0.0, 0.0, 4e-9), own, column(0.0, 5e-9, 0.0), made_of
     plain = LinearProblem(lambda t, inside: None, one, floor=column(0.0, 0.0, 1e-2))
