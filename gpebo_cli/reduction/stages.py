@@ -53,6 +53,11 @@ class UnclearError(Exception):
         self.sudden = sudden  # whether it is the same at most times
 
 
+def _without_dust(E: Array) -> Array:
+    """Matrices (N, n, n) in which zeros stand for entries with which LAPACK's SVD may not end."""
+    return np.where(np.abs(E) > _FAR_BELOW * np.abs(E).max(axis=(1, 2), keepdims=True), E, 0.0)
+
+
 def in_stages(
     E: Array, A: Array, f: Array, rank_tol: float, every: int,
     ranks: Sequence[int] | None = None,
@@ -80,9 +85,7 @@ def in_stages(
             raise UnclearError(place, rounding=bool(near[place]) and not vanish, sudden=sudden)
 
     while True:
-        # With entries far below all rounding, LAPACK's iteration may not end.
-        clear = np.abs(E[0]) > _FAR_BELOW * np.abs(E[0]).max(axis=(1, 2), keepdims=True)
-        U, sigma, Vt = np.linalg.svd(np.where(clear, E[0], 0.0))
+        U, sigma, Vt = np.linalg.svd(_without_dust(E[0]))
         relative = sigma / np.maximum(sigma[:, :1], _TINY)
         counts = (relative > np.maximum(rank_tol, _CLEAR * errors.noise)[:, None]).sum(axis=1)
         r, n = int(counts[0]) if ranks is None else (*ranks, len(U[0]))[len(found)], len(U[0])
