@@ -43,7 +43,7 @@ def canonical(**changes):
         ({"plant": plant_from_mapping(HIDDEN)}, "t = 1 puts an impulse into b; an observer cannot"),
         *(({"data": {"name": "csv", "file": file}}, "data=csv needs data.file=FILE")
           for file in (None, "", [])),
-        ({"data": {"name": "csv", "frame": 3}}, "expected a file or a pandas.DataFrame, got 3"),
+        ({"data": {"name": "csv", "frame": 3}}, "a list of files or one pandas.DataFrame, got 3"),
         ({"data": {"name": "csv", "file": "-"}}, "standard input is for gpebo run"),
         ({"data": ROWS[:1]}, "data has 1 rows; at least 2"),
         (

@@ -251,7 +251,7 @@ def strangeness_free(
 
     By these times is judged which derivatives of inputs there are. ``signals`` are [u; y] there (N,
     m + r), for matrices that follow them (ConfigError: a derivative is needed of an input, or of an
-    output, of which it is not known).
+    output, of which it is not known; ModelError: the equations do not determine the states).
     """
     system, inputs = given.system, given.inputs
     source = system.coefficients
