@@ -367,9 +367,9 @@ def _shifted(
     """Take W away: x_j = x̃_j − Σ W x_k, x̃_j' = … + W' x_k."""
     shifts = []
     for j, i in equation_of.items():
-        W = {k: w for k, w in E.rows.get(i, {}).items() if k != j}
-        if not W:
+        if len(E.rows.get(i, ())) < 2:  # x_j' alone
             continue
+        W = {k: w for k, w in E.rows[i].items() if k != j}
         shifts.append((j, W, _NOTHING))
         for other in list(A.where(j)):
             A.add(other, -A.row(other)[j], W, None)
