@@ -775,6 +775,7 @@ def test_files_of_matrices(tmp_path):
     for name, matrix in (("E", E), ("A", A), ("B", B), ("C", C)):
         mmwrite(folder / f"plant.{name}.mtx", sparse.coo_matrix(matrix))
     expected = from_matrices({"E": E.toarray(), "A": A, "B": B, "C": C}, "p").mapping()
+    assert {*expected["inputs"].values()} == {0.0}  # nobody has said what they are
     for path in (tmp_path / "a.mat", folder):
         assert {**from_file(path, "p").mapping(), "reference": None} == {
             **expected, "reference": None
