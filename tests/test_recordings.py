@@ -565,6 +565,9 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         read("", frame=pd.DataFrame(good).iloc[:1])
     with refused("row 1, column t: nan"):  # whatever is done about gaps of signals
         read("", frame=pd.DataFrame(good | {"t": [0.0, np.nan, 1.0]}), missing="hold")
+    back = {"t": [0.0, 0.5, 0.2], "V": [1.0, 2.0, np.nan]}
+    with refused("0.2 follows 0.5; times must increase"):  # where a signal is missing, too
+        read("", frame=pd.DataFrame(good | back), missing="hold")
 
 
 def test_dates_of_a_data_frame_may_be_text():
