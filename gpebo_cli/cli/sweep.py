@@ -8,6 +8,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -30,6 +31,7 @@ from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.model.archive import ARCHIVE
+from gpebo_cli.reading import open_regular
 from gpebo_cli.results import sweep_folder
 from gpebo_cli.results.files import csv_text, make_folder, write_text
 from gpebo_cli.results.names import shown_metrics
@@ -230,9 +232,9 @@ def _digest(configs: Iterable[DictConfig]) -> str:
         content.pop("hydra", None)
         found.update(OmegaConf.to_yaml(OmegaConf.create(content), sort_keys=True).encode())
         for file, place in product(_files(content), ["", *places]):
-            if os.path.isfile(path := os.path.join(place, file)):
-                with open(path, "rb") as stream:
-                    found.update(hashlib.file_digest(stream, "sha256").digest())
+            # What cannot be read is refused by the jobs.
+            with suppress(ConfigError), open_regular(os.path.join(place, file)) as stream:
+                found.update(hashlib.sha256(stream.read()).digest())
     return found.hexdigest()[:16]
 
 
