@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from gpebo_cli.numerics import series
+from gpebo_cli.kernels import elements_numpy
+from gpebo_cli.numerics import series, taylor
 from gpebo_cli.numerics.elimination import StiffError, _residual, by_elimination
 from gpebo_cli.numerics.mesh import Mesh
-from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.numerics.series import sparse
+from gpebo_cli.numerics.taylor import by_entries
 
 S, D = 5, 12
 RULE = radau_rule(S)
@@ -21,7 +22,7 @@ def system(rng, count, varying=True):
     for i in range(D):
         A[:, i, i] = -(10.0 ** rng.uniform(0, 6)) * rng.uniform(1, 2, len(A))
         A[:, i, (i + 1) % D], A[:, i, i - 1] = rng.normal(size=(2, len(A)))
-    return A, sparse(A)
+    return A, by_entries(A)
 
 
 def solved(matrix, f, kicks, start, h=H):
@@ -64,11 +65,11 @@ def test_pivots_that_harm_are_seen():
     real = float(largest[np.abs(largest.imag) < 1e-9].real[0])
     A = -np.eye(D)[None]
     A[0, 0, 0], A[0, 0, 1], A[0, 1, 0] = real / H[0] * (1.0 + 1e-13), 1.0, -1.0
-    _, left = solved(sparse(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
+    _, left = solved(by_entries(A), np.zeros((1, D, 0)), None, np.ones((D, 1)), H[:1])
     assert left.max() > 1e-13
 
     def equation(mesh):
-        return sparse(A), np.zeros((1, D, 1)), ()
+        return by_entries(A), np.zeros((1, D, 1)), ()
 
     problem, mesh = LinearProblem(None, np.ones((D, 1))), Mesh(np.array([0.0, H[0]]), RULE)
     limits = {"units": np.ones(D), "tol": 1e-9, "max_elements": 99, "stiff": True}
@@ -81,7 +82,7 @@ def test_what_elimination_fills_is_refused():
     A = np.random.default_rng(3).normal(size=(1, 60, 60))
     A[0][np.random.default_rng(4).uniform(size=(60, 60)) < 0.75] = 0.0
     with pytest.raises(StiffError):
-        solved(sparse(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))
+        solved(by_entries(A), np.zeros((1, 60, 0)), None, np.ones((60, 1)))
 
 
 @pytest.mark.parametrize("varying", [False, True])
@@ -112,7 +113,7 @@ def test_matrices_by_their_entries_are_what_full_ones_are(times):
     rng = np.random.default_rng(times)
     A = rng.normal(size=(times, 9, 9)) * (rng.random((9, 9)) < 0.2)
     A[:, 0], A[:, :, 0], A[:, range(1, 9), range(1, 9)] = 0.0, 0.0, -2.0
-    matrix, units = sparse(A), 10.0 ** rng.integers(-3, 4, 9)
+    matrix, units = by_entries(A), 10.0 ** rng.integers(-3, 4, 9)
     np.testing.assert_array_equal(matrix.full(), A)
     for columns in (1, 30):
         x = rng.normal(size=(4, 9, columns))
@@ -120,7 +121,7 @@ def test_matrices_by_their_entries_are_what_full_ones_are(times):
     sizes = matrix.sizes(2 if times == 4 else 1)
     largest = np.abs(A).reshape(len(sizes), -1, 9, 9).max(axis=1)
     np.testing.assert_array_equal(matrix._replace(entries=sizes).full(), largest)
-    turned = sparse(A * units / units[:, None])
+    turned = by_entries(A * units / units[:, None])
     rates = np.linalg.eigvals(A)
     for one, own in ((matrix, np.ones(9)), (turned, 1.0 / units)):
         norms, plain = one.norms(one.sizes(times), own), np.abs(A)
@@ -132,6 +133,33 @@ def test_matrices_by_their_entries_are_what_full_ones_are(times):
         assert one.growth(own, 1e9) == pytest.approx(matrix.growth(np.ones(9), 1e9), rel=1e-12)
 
 
-def test_matrices_of_which_most_entries_are_there_are_full():
-    assert sparse(np.ones((2, 3, 3))) is None
-    assert len(sparse(np.eye(4)[None]).columns) == 4
+def test_full_matrices_are_not_solved_by_series_of_their_entries():
+    def full(t, inside):
+        return LinearEquation(None, -np.ones((len(t), D, D)), np.zeros((1, D, 1)))
+
+    problem = LinearProblem(full, np.ones((D, 1)))
+    mesh = Mesh(np.linspace(0.0, 1.0, 9), RULE)
+    assert series.solve_dense(problem, mesh, tol=1e-6, max_elements=99) is None
+    assert len(by_entries(np.eye(4)[None]).columns) == 4
+
+
+@pytest.mark.parametrize("length", [0.05, 0.2, 0.6])
+@pytest.mark.parametrize("constant", [False, True])
+def test_maps_of_elements_by_series_are_those_of_their_systems(length, constant):
+    """In full and sparse systems, in one part and several, whatever the size of what drives."""
+    rng, rule, n, K = np.random.default_rng(int(100 * length)), radau_rule(14), 14, 3
+    mesh = Mesh(length * np.array([0.0, 0.1, 0.5, 1.0]), rule)
+    t = mesh.points.ravel()[:, None, None]
+    for full in (True, False):
+        one, other = rng.normal(size=(2, n, n)) * (full or rng.random((n, n)) < 0.3)
+        A = one + np.sin(3.0 * t) * other
+        f = np.zeros((1 if constant else len(t), n, 4))
+        f[:, :, 1] = 1e-9 * np.cos((0.0 if constant else t[:, 0]) + rng.normal(size=n))
+        f[:, 3, 2] = 1e5 * (1.0 if constant else t[:, 0, 0])
+        found = taylor.element_maps(rule, mesh.steps, A, f)
+        expected = elements_numpy.element_maps(
+            rule.differentiation, mesh.steps, None, A, f, None, None, np.arange(K), K
+        )
+        for own, system in zip(found, expected, strict=True):
+            assert (np.abs(own - system) <= 1e-11 * np.abs(system).max(axis=(0, 1, 2))).all()
+    assert taylor.element_maps(rule, mesh.steps, 1e5 * A, f) is None  # stiff

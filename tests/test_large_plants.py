@@ -567,7 +567,7 @@ def test_initial_values_that_cannot_be_the_unknown_ones(observer, says):
 
 def test_the_extension_by_series_is_that_of_dense_elements(monkeypatch):
     found = observed(None)
-    monkeypatch.setattr(extension.series, "sparse", lambda *_: None)
+    monkeypatch.setattr(extension.series, "solve_dense", lambda *_, **__: None)
     dense = observed(None)
     for name in ("x3", "x12"):  # before the end parameters are hardly told apart
         one, other = found.estimates[name][0, -1], dense.estimates[name][0, -1]

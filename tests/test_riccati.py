@@ -340,3 +340,23 @@ def test_window_gramians_of_a_constant_system(stages):
     np.testing.assert_allclose(
         found.gramians, np.broadcast_to(expected, found.gramians.shape), rtol=1e-9
     )
+
+
+def test_a_chain_of_many_states_needs_few_elements():
+    """The first of 12 states is measured: rates of the filter fall from 1e5 to 1 in 1/s."""
+    n = 12
+    A = np.diag(np.ones(n - 1), 1) - np.diag(np.ones(n - 1), -1)
+    case = Case(
+        lambda t: (1.0 + 0.1 * np.sin(t)) * A, lambda t: np.eye(n)[1] * np.sin(t),
+        lambda t: np.eye(1, n), lambda t: np.array([np.cos(t)]),
+        lambda t: np.eye(n, n + 1), lambda t: np.eye(1, n + 1, n),
+        np.diag([1e-3] * n + [1e-4]),
+    )
+    start, P0, t = np.zeros(n), 10.0 * np.eye(n), np.array([1e-5, 0.01, 1.0, 8.0])
+    found = case.filtered(start, P0, 8.0)
+    expected, estimates = case.by_scipy(start, P0, t)
+    P, estimate = found.at(t)
+    assert relative(P, expected) < 1e-8
+    np.testing.assert_allclose(estimate[..., 0], estimates, atol=1e-8)
+    assert found.error_estimate < 1e-8
+    assert found.mesh.size < 150

@@ -28,6 +28,7 @@ import numpy as np
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels import elements, elements_numpy
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.numerics import taylor
 from gpebo_cli.numerics.errors import (
     CHANCE,
     EPS,
@@ -50,8 +51,9 @@ from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_sc
 from gpebo_cli.numerics.refinement import refine
 from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
 
-_CHUNK = 1 << 20  # numbers in one batch of element systems (8 MB)
+_CHUNK = 1 << 20  # numbers of maps that are made at once (8 MB)
 _DIRECT = 400  # unknowns
+_SERIES = 100  # unknowns, from which on series may cost less
 _POINTS = 1 << 14  # at which coefficients are evaluated at once: what fits the cache
 _COARSE = 1e-6  # tails beyond that are rounding, and of which component is not known
 _BEYOND = 5.0  # times what the constraints are seen to be missed by, which counts of a bound
@@ -233,14 +235,11 @@ def merged(before: Sequence[Array], after: Sequence[Array], kept: IntArray) -> l
 def _element_maps(
     problem: LinearProblem, mesh: Mesh, elements: BoolArray, known: LinearEquation | None
 ) -> _Maps:
-    """Solve the block systems of some elements in chunks of bounded memory."""
+    """What some elements make of their left ends, found in chunks of bounded memory."""
     n, columns = problem.start.shape
     s = mesh.rule.stages
     h, t, inside = (each[elements] for each in (mesh.steps, mesh.points, mesh.inside))
-    numbers = s * n * (n + columns)
-    if known is None or not _is_constant(known):
-        numbers += s * s * n * n
-    chunk = max(1, min(_CHUNK // max(numbers, 1), _POINTS // (s + 1)))
+    chunk = max(1, min(_CHUNK // max(s * n * (n + columns), 1), _POINTS // (s + 1)))
     whole: list[Array] = []  # filled piece by piece: all pieces beside the whole are twice as much
     for i in range(0, len(h), chunk):
         part = slice(i, i + chunk)
@@ -285,8 +284,11 @@ def _solve_elements(
         groups = int(group.max(initial=-1)) + 1
         if s * c.A.shape[1] > _DIRECT:
             solve = partial(elements_numpy.element_maps, solve=solve_constant)
+    found = None
+    if c.E is None and basis is None and len(c.A) > 1 and s * c.A.shape[1] > _SERIES:
+        found = taylor.element_maps(mesh.rule, h, c.A, c.f)
     try:
-        homogeneous, particular = solve(
+        homogeneous, particular = found or solve(
             mesh.rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
         )
     except np.linalg.LinAlgError as error:

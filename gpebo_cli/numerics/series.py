@@ -1,8 +1,7 @@
 """Large systems that are not stiff, x' = A x + f with few entries: series in time.
 
-An element needs no factorisation where h‖A‖ is modest: with A and f in powers of the time, as their
-values at points say, terms ``(k + 1) X_{k+1} = h (Σ A_j X_{k−j} + f_k)`` fall like (h‖A‖)^k/k!,
-and one costs as much as the entries of A. Errors are carried on by the same series, to two digits.
+An element needs no factorisation where h‖A‖ is modest, see :mod:`.taylor`. Errors are carried on by
+the same series, to two digits.
 
 Where h‖A‖ is not modest, equations of collocation are solved: by :mod:`.elimination`, or where A is
 full and constant with one factorisation for all elements of one length.
@@ -13,113 +12,32 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache, partial
-from math import factorial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.polynomial import legendre
 
-from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.numerics import taylor
 from gpebo_cli.numerics.collocation import LinearSolution, decoupled, unresolved_signals
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, TINY, Errors, judged_errors, random_signs
-from gpebo_cli.numerics.linalg import largest_over_time, largest_within
 from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
-from gpebo_cli.numerics.radau import ComplexArray, RadauRule
+from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
+from gpebo_cli.numerics.taylor import DENSE, LENGTH, Sparse, by_entries
 
-LENGTH = 4.0  # h‖A‖ of an element at most
-_MOST_PARTS = 16  # of an element, each with its series, where coefficients
-_DECAY = 1.6  # are to decay like powers of 1 over this
 MOST_ELEMENTS = 800  # with more of them the system counts as stiff
 _DIGITS = 1e-2  # of the tolerance, to which series go on
 _ROUGH = 0.02  # to which errors are carried
-_LOOKED_AT = 1 << 25  # times by states³, at which growth is looked at
-_DENSE = 0.3  # share of entries, from which on a matrix counts as full
-_WORTH = 0.5  # columns times that share, from which on it is multiplied as if it were
 _AT_ONCE = 4  # elements of which all points are held, where errors are carried
 _FEW_COLUMNS = 4  # whose errors are carried one by one
 
 # Values (K, s + 1, d, c) of x' = A x + f on a mesh, f of the first columns, from a start (d, c),
 # with kicks (K, d, c) at right ends; and how far each element may be from a solution, relative
-March = Callable[[Mesh, "Sparse", Array, Any, Array, float], tuple[Array, Array]]
-
-
-class Sparse(NamedTuple):
-    """Matrices (N or 1, d, d) by their rows."""
-
-    rows: IntArray  # (d + 1,) where each begins
-    columns: IntArray  # (e,) of the entries
-    entries: Array  # (N or 1, e)
-
-    def sizes(self, elements: int) -> Array:
-        """The largest of each entry in each of so many elements, (K or 1, e)."""
-        count = min(elements, len(self.entries))
-        return largest_within(self.entries.reshape(count, len(self.entries) // count, -1))
-
-    def full(self) -> Array:
-        """With every entry, (N or 1, d, d)."""
-        d = len(self.rows) - 1
-        out = np.zeros((len(self.entries), d, d))
-        out[:, np.repeat(np.arange(d), np.diff(self.rows)), self.columns] = self.entries
-        return out
-
-    def growth(self, units: Array, enough: float) -> float:
-        """How fast x' = A x may grow at any of the times, at most; or what is below ``enough``.
-
-        Gershgorin's discs, in ``units`` of the states (d,), say so without eigenvalues, if these
-        are needed for nothing else; eigenvalues are of a few times.
-        """
-        d, N = len(units), len(self.entries)
-        of_row = np.repeat(np.arange(d), np.diff(self.rows))
-        own = np.zeros((N, d))
-        own[:, of_row[of_row == self.columns]] = self.entries[:, of_row == self.columns]
-        discs = own - np.abs(own)
-        discs += self.row_sums(np.abs(self.entries) * (units[self.columns] / units[of_row]))
-        if discs.max(initial=0.0) <= enough:
-            return float(discs.max(initial=0.0))
-        some = np.linspace(0, N - 1, int(np.clip(_LOOKED_AT // d**3, 1, 32)), dtype=np.intp)
-        full = self._replace(entries=self.entries[some]).full()
-        return float(np.linalg.eigvals(full).real.max(initial=0.0))
-
-    def product(self, entries: Array, x: Array) -> Array:
-        """Products (K, d, c) of matrices with these entries (K or 1, e) and x (K, d, c)."""
-        share = len(self.columns) / max(x.shape[1], 1) ** 2
-        if share > (_DENSE if len(entries) == 1 else 1.0) or x.shape[2] * share > _WORTH:
-            return self._replace(entries=entries).full() @ x
-        return self.row_sums(entries[:, None] * x.swapaxes(1, 2)[..., self.columns]).swapaxes(1, 2)
-
-    def row_sums(self, terms: Array) -> Array:
-        """Sums (…, d) of terms (…, e), one of each entry, over the entries of rows."""
-        there, out = np.diff(self.rows) > 0, np.zeros((*terms.shape[:-1], len(self.rows) - 1))
-        if len(self.columns):
-            out[..., there] = np.add.reduceat(terms, self.rows[:-1][there], axis=-1)
-        return out
-
-    def norms(self, entries: Array, units: Array) -> Array:
-        """Bounds (K,) of the spectral radius: norms, in units of the states (d,) and without."""
-        K, d = len(entries), len(units)
-        of_row, first = np.repeat(np.arange(d), np.diff(self.rows)), d * np.arange(K)[:, None]
-        sums = [
-            np.bincount((first + place).ravel(), scaled.ravel(), K * d).reshape(K, d)
-            for scaled in (entries, entries * (units[self.columns] / units[of_row]))
-            for place in (of_row, self.columns)
-        ]
-        return np.asarray(np.max(sums, axis=2, initial=0.0).min(axis=0))
-
+March = Callable[[Mesh, Sparse, Array, Any, Array, float], tuple[Array, Array]]
 
 Equation = tuple[Sparse, Array, tuple[Array, ...]]
-
-
-def sparse(A: Array) -> Sparse | None:
-    """Matrices (N or 1, d, d) by their entries; None if most are there."""
-    there = (A != 0.0).any(axis=0)
-    i, j = np.nonzero(there)
-    if len(i) > _DENSE * there.size:
-        return None
-    return Sparse(np.searchsorted(i, np.arange(len(there) + 1)), j, A[:, i, j])
 
 
 def solve(
@@ -133,9 +51,9 @@ def solve(
     Where it is ``stiff``, elements are solved, without series.
     """
     A, _, _ = equation(mesh)
-    march: March = partial(_series, 1.0 / units)
+    march: March = partial(taylor.march, 1.0 / units)
     if stiff:
-        full = len(A.entries) == 1 and len(A.columns) > _DENSE * len(A.rows) ** 2
+        full = len(A.entries) == 1 and len(A.columns) > DENSE * len(A.rows) ** 2
         march = by_factors(A) if full else by_elimination
     else:
         parts = np.ceil(mesh.steps * A.norms(A.sizes(mesh.size), units) / LENGTH)
@@ -193,8 +111,8 @@ def solve_dense(
     def equation(mesh: Mesh) -> Equation:
         c = known if mesh is first else None
         c = c or problem.coefficients(mesh.points.ravel(), mesh.inside.ravel())
-        A = sparse(c.A)
-        if A is None:
+        A = by_entries(c.A)
+        if len(A.columns) > DENSE * c.A[0].size:
             raise StiffError
         return A, c.f, tuple(at_points(e, mesh.size, mesh.rule.stages) for e in c.extras)
 
@@ -218,94 +136,6 @@ class _Found(NamedTuple):
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
     extras: tuple[Array, ...]
-
-
-def _series(
-    weights: Array, mesh: Mesh, A: Sparse, f: Array, kicks: Array | None, start: Array, tol: float
-) -> tuple[Array, Array]:
-    """Series in time over one element after the other, with weights (d,) of the states.
-
-    With kicks only values at both ends of each element.
-    """
-    size, of_f = np.maximum(largest_over_time(A.entries), TINY), f.reshape(len(f), -1)
-    largest, rule = largest_over_time(of_f), mesh.rule
-    terms = _powers(_degrees(A.entries, size, rule, tol))
-    decay = _largest_shares(terms, size)
-    later = decay[:, 1:] * (decay[:, 1:] > tol)
-    rates = (later ** (1.0 / np.arange(1, decay.shape[1]))).max(axis=1, initial=0.0)
-    parts = np.ceil(np.clip(_DECAY * rates, 1.0, _MOST_PARTS)).astype(np.intp)
-    parts = np.broadcast_to(parts, mesh.size)
-    nodes, pieces = rule.nodes if kicks is None else rule.nodes[-1:], []
-    # So many elements at once that they have no more parts than there are elements.
-    count = -(-mesh.size // int(parts.max()))
-    for first in range(0, mesh.size, count):
-        some, forced = slice(first, first + count), np.zeros(0)
-        at = slice(len(rule.points) * first, len(rule.points) * (first + count))
-        if count < mesh.size:
-            terms = np.zeros(0)  # what was there goes before there is more
-            terms = _powers(_degrees(A.entries[at], size, rule, tol), parts[some])
-            decay = _largest_shares(terms, size)
-        there = of_f if len(f) == 1 else of_f[at]
-        forced = _powers(_degrees(there, largest, rule, tol), parts[some])
-        pieces.append(elements.series(
-            nodes, mesh.steps[some], parts[some], A.rows, A.columns, terms.swapaxes(1, 2),
-            np.maximum.accumulate(decay[:, ::-1], axis=1)[:, ::-1],
-            forced.reshape(*forced.shape[:2], *f.shape[1:]),
-            None if kicks is None else kicks[some], start, weights, tol, SHARE,
-        ))
-        start = pieces[-1][0][-1, -1] + (0.0 if kicks is None else kicks[some][-1])
-    if len(pieces) == 1:
-        return pieces[0]
-    del terms, forced
-    values, change = (np.concatenate(each) for each in zip(*pieces, strict=True))
-    return values, change
-
-
-def _degrees(values: Array, size: Array, rule: RadauRule, tol: float) -> Array:
-    """Legendre coefficients (K or 1, g, w) of functions (N or 1, w) in each element.
-
-    Degrees that are smaller than ``tol`` of the size (w,) are left out.
-    """
-    if len(values) == 1:
-        return values[None]
-    points = len(rule.points)
-    found = rule.to_legendre @ values.reshape(len(values) // points, points, -1)
-    counts = (largest_over_time(found) > tol * size).any(axis=1)
-    return found[:, : 1 + int(np.flatnonzero(counts).max(initial=0))]
-
-
-def _powers(degrees: Array, parts: IntArray | None = None) -> Array:
-    """From :func:`_degrees` to powers of the time in each part of elements, (P or 1, g, w).
-
-    How many ``parts`` each element has, (K,); None: one.
-    """
-    g, w = degrees.shape[1:]
-    if parts is None or parts.max() == 1:
-        return np.asarray(_legendre_powers(g, 1) @ degrees)
-    if len(degrees) == g == 1:
-        return degrees
-    # Powers of one function follow each other, as series take them.
-    found, first = np.empty((parts.sum(), w, g)).swapaxes(1, 2), parts.cumsum() - parts
-    for count in set(parts.tolist()):
-        some = parts == count
-        for k, changed in enumerate(_legendre_powers(g, count)):
-            found[first[some] + k] = changed @ degrees[some]
-    return found
-
-
-def _largest_shares(values: Array, size: Array) -> Array:
-    """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
-    of_powers = np.moveaxis(values, 1, 0)
-    return np.stack([np.abs(one / size).max(axis=1, initial=0.0) for one in of_powers], axis=1)
-
-
-@lru_cache
-def _legendre_powers(degrees: int, parts: int) -> Array:
-    """Legendre polynomials on [0, 1] in powers of time in each part, (parts, powers, degrees)."""
-    left = 2.0 * np.arange(parts) / parts - 1.0
-    slopes = [legendre.legval(left, legendre.legder(np.eye(degrees), m)) for m in range(degrees)]
-    each = [(2.0 / parts) ** m / factorial(m) * slope for m, slope in enumerate(slopes)]
-    return np.array(each).transpose(2, 0, 1)
 
 
 def by_factors(A: Sparse) -> March:

@@ -49,7 +49,7 @@ _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
 _STAGES = 8  # at least, at first: P falls fast from where it starts, whatever a mesh was made for
 _MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages that they need
 _ROOM = 8  # times as many elements may be needed with few stages
-_GROWTH = 1e3  # of X₁ within an element: as many digits of P are lost
+_GROWTH = 1e3  # of X₁ within an element, at most: as many digits of P are lost
 
 
 class StateSpace(NamedTuple):
@@ -159,10 +159,12 @@ def run_filter(
     if before is None:
         m, _ = model(mesh.points.ravel(), mesh.inside.ravel())
         horizon = horizon or float(mesh.edges[-1] - mesh.edges[0])
-        unit, variance, tol = _scaled(m, P0, horizon, sizes, tol, name, advice)
+        unit, variance, fastest = _scaled(m, P0, horizon, sizes, name, advice)
+        # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
+        tol = max(tol, _LEFT * float(np.finfo(float).eps) * fastest * horizon)
         first = pair(P0 / (variance * np.outer(unit, unit)), start / unit[:, None])
     else:
-        unit, variance, tol = before.unit, before.variance, before.tol
+        unit, variance, tol, fastest = before.unit, before.variance, before.tol, 0.0
         first = pair(*quotient(before.pair.final))
     least = float((floor / unit).max(initial=0.0))
 
@@ -184,16 +186,16 @@ def run_filter(
         ]
 
     def signals(values: Array, extras: tuple[Array, ...]) -> list[Kind]:
+        lost, growth = _conditioning(values, tol)
+        if lost < len(values):  # what follows is no number to be resolved
+            values = values.copy()
+            values[lost:] = values[lost, 0]
         P, estimate = quotient(values)
         d = _deviations(P)
         own = P / (d[:, None, :, None] * d[:, None, None, :])
-        found = [(own.reshape(*own.shape[:2], -1), 0.0), *followed(estimate, extras)]
-        n = P.shape[-1]
-        grown = np.abs(values[..., :n, :n]).max(axis=(1, 2, 3), initial=0.0)
-        if (lost := grown > _GROWTH).any():  # no signal is resolved where conditioning is lost
-            alternating = np.resize([1.0, -1.0], P.shape[1])[:, None]
-            found.insert(0, (np.where(lost[:, None, None], alternating, 0.0), 0.0))
-        return found
+        return [
+            (growth, 0.0), (own.reshape(*own.shape[:2], -1), 0.0), *followed(estimate, extras)
+        ]
 
     problem = LinearProblem(
         coefficients, first, signals, name,
@@ -204,7 +206,10 @@ def run_filter(
         stages, begin = max(mesh.rule.stages, 0 if before else _STAGES), mesh.edges[0]
         if _MANY < mesh.size < max_elements / _ROOM:
             stages = min(stages, _FEW)
-        mesh = Mesh(mesh.edges - begin, radau_rule(stages), mesh.origin + begin)
+        # P falls as 1/t: what is not resolved first spoils all that follows.
+        edges, halves = mesh.edges - begin, int(np.log2(max(fastest * mesh.steps[0], 1.0)))
+        edges = np.insert(edges, 1, edges[1] * np.exp2(np.arange(-halves, 0)))
+        mesh = Mesh(edges, radau_rule(stages), mesh.origin + begin)
         solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
         P, estimate = quotient(solution.trajectory.values)
         error_estimate = _error(problem, solution.trajectory, followed)
@@ -233,10 +238,9 @@ def run_filter(
 
 
 def _scaled(
-    m: StateSpace, P0: Array, horizon: float, sizes: Array | float, tol: float, name: str,
-    advice: str,
+    m: StateSpace, P0: Array, horizon: float, sizes: Array | float, name: str, advice: str,
 ) -> tuple[Array, float, float]:
-    """Units (n,) of ζ, a factor of all covariances, and the tolerance that rounding leaves."""
+    """Units (n,) of ζ, a factor of all covariances, and how fast P falls at first, in 1/s."""
     deviation = np.sqrt(np.diag(P0))
     unit = _units(m.A, deviation, horizon, sizes)
     W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
@@ -245,14 +249,27 @@ def _scaled(
     # by nothing is rounding, and is not made larger.
     seen = float((W * np.outer(unit, unit)).max(initial=0.0)) * horizon
     variance = 1.0 / max(seen, _UNSEEN)
-    fall = float((W * np.outer(deviation, deviation)).max(initial=0.0)) * horizon
-    if fall > _FALL:
+    fastest = float((W * np.outer(deviation, deviation)).max(initial=0.0))
+    if fastest * horizon > _FALL:
         raise SolverError(
-            f"the covariance of the {name} would fall to {1 / fall:.1e} of where it starts, beyond "
-            f"the digits of a double; {advice}"
+            f"the covariance of the {name} would fall to {1 / (fastest * horizon):.1e} of where it "
+            f"starts, beyond the digits of a double; {advice}"
         )
-    # The rounding of P(0) is what is left to resolve of a P that has fallen so far.
-    return unit, variance, max(tol, _LEFT * float(np.finfo(float).eps) * fall)
+    return unit, variance, fastest
+
+
+def _conditioning(values: Array, tol: float) -> tuple[int, Array]:
+    """The first element in which X₁ grows too much, and a signal (K, s + 1, 1) that tells where.
+
+    It leaves out as much as cuts each element into as many parts as its growth asks for.
+    """
+    n, (_, points) = values.shape[2] // 2, values.shape[:2]
+    grown = np.abs(values[..., :n, :n]).max(axis=(1, 2, 3), initial=1.0)
+    parts = np.log(grown) / np.log(_GROWTH)
+    left_out = np.minimum(tol * (1.5 * np.maximum(parts, 1.0)) ** (points - 1), 1.0)
+    shown = np.where(parts > 1.0, left_out, 0.0)[:, None, None]
+    first = int(np.argmax(parts > 1.0)) if shown.any() else len(values)
+    return first, 1.0 + shown * np.resize([1.0, -1.0], (points, 1))
 
 
 def _deviations(P: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import inverses
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.series import Sparse
+from gpebo_cli.numerics.taylor import Sparse
 from gpebo_cli.reduction.explicit import MoreOrdersError, UndecidedError
 from gpebo_cli.reduction.scaling import scales_of
 

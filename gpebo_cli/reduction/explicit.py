@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.model.entries import Entries
 from gpebo_cli.model.expressions import jets
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.series import Sparse
+from gpebo_cli.numerics.taylor import Sparse
 from gpebo_cli.reduction.scaling import Scaling, balance_entries
 
 _STEADY = 0.2  # a pivot keeps this share of its largest value at all times
