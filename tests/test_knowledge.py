@@ -17,7 +17,7 @@ from plants import one_state, shipped
 from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
-from gpebo_cli import run
+from gpebo_cli import from_mechanics, run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.sensors import _fall, candidates
@@ -451,6 +451,35 @@ def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model
     fit = result.details.fit
     assert fit.residual[0] < 1e-3 * fit.size
     assert "missing or wrong parameter" not in result.verdict
+
+
+def test_a_position_that_a_constraint_holds_is_known_whatever_is_measured():
+    """All that is there of it is rounding; another constraint has it in it, too."""
+    names = ["left", "still", "right", "far", "on"]
+    mechanism = from_mechanics({
+        "M": np.diag([1.7, 0.33, 1.1, 2.5, 1.9]), "K": np.diag([12.3, 16.1, 8, 0.83, 11.5]),
+        "G": [[0, 0.82, 0, 0, 0], [-0.39, 0.8, -0.61, 0, 0]], "unknowns": {"a": 1.5, "b": 0.5},
+        "F": [[0.94, -1.06], [1.11, -0.62], [-1.01, 0.94], [-0.22, -0.39], [0.46, -0.1]],
+        "positions": names, "measure": ["v_far"],
+    }, "held")
+    found = run(mechanism.mapping(), time={"horizon": 4, "samples": 21}).details.estimable
+    assert {name for name in names if found[name] is not None} == {"still"}
+    assert found["v_still"] == 0.0
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_state_that_no_parameter_has_part_in_is_no_doubt_in_any_unit(seed):
+    """Beside a kernel of G that leaves the others open, and zero as it is."""
+    rng = np.random.default_rng(seed)
+    psi, units = rng.normal(size=(9, 3)), 10.0 ** rng.uniform(-6, 6, 4)
+    psi[:, 2] = psi[:, 1]
+    gain = units[:, None] * rng.normal(size=(5, 4, 3))
+    gain[:, 1] *= 1e-17
+    offset = np.zeros((5, 4))
+    known = knowledge((psi.T @ psi)[None], np.ones(3), np.ones(1))
+    h = psi.T @ psi @ rng.normal(size=3)
+    told = known.states(gain, units)[-1] & known.resolved(h, offset, gain, 1.0, units)
+    assert told.tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize("rate", [0.5, -0.5])

@@ -133,28 +133,30 @@ class Knowledge:
         if not kernel.any() and np.isfinite(gain).all():
             return np.ones((len(kernel), gain.shape[1]), dtype=bool)
         last = gain[len(gain) - len(kernel) :]
-        if units is not None:  # the row of a state that no parameter has part in is rounding
-            own = np.abs(gain)
-            own /= units[:, None]
-            whole = np.fmax.reduce(own, axis=1, initial=0.0)
-            whole = np.maximum.accumulate(whole)[-len(last) :, None]
-            last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
+        if units is not None:
+            last = np.where(_rounding(gain, units)[-len(last) :], 0.0, last)
         scaled = last / self.sizes[:, None, :]
         left, size = (np.einsum("mnp,mnp->mn", x, x) for x in (scaled @ kernel, scaled))
         return np.asarray(np.sqrt(left) <= slack[:, None] * np.sqrt(size))
 
-    def resolved(self, h: Array, offset: Array, gain: Array, growth: float | None) -> BoolArray:
+    def resolved(
+        self, h: Array, offset: Array, gain: Array, growth: float | None,
+        units: Array | None = None,
+    ) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
 
-        Neither what the kernel of N leaves open, nor rounding, may amount to more than a thousandth
-        of them; a small ``growth`` of Φ explains no state that is smaller still beside its terms.
-        Of h = ∫ψᵀY at the end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN
-        where nothing is known.
+        That is so of one that no parameter has part in, even if it is zero. Neither what the kernel
+        of N leaves open, nor rounding, may amount to more than a thousandth of the others; a small
+        ``growth`` of Φ explains no state that is smaller still beside its terms. Of h = ∫ψᵀY at the
+        end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN where nothing is known;
+        ``units`` as for :meth:`states`.
         """
         small = (growth or 0.0) < LARGE
         if small and (self.clarity[-1] >= 1.0).all():
             return np.ones(gain.shape[1], dtype=bool)
         error, z = self.doubt(h, gain[-1])
+        if units is not None:
+            error[_rounding(gain, units).all(axis=(0, 2))] = 0.0
         size = np.abs(offset + gain @ z).max(axis=0)
         if small:
             size = np.maximum(size, np.abs(gain[-1]) @ np.abs(z) / LARGE)
@@ -178,6 +180,17 @@ class Knowledge:
         of_each = np.abs(row @ (told / spectrum[clear]) @ told.T) @ met
         error = unseen + _NOISE * (np.minimum(of_all, of_each) + np.abs(row) @ np.abs(z))
         return np.asarray(error), z / self.sizes[-1]
+
+
+def _rounding(gain: Array, units: Array) -> BoolArray:
+    """What of a gain (N, n, p) is rounding beside that of other states so far, in their units.
+
+    All of the row of a state is that no parameter has part in.
+    """
+    own = np.abs(gain)
+    own /= units[:, None]
+    whole = np.maximum.accumulate(np.fmax.reduce(own, axis=1, initial=0.0))
+    return np.asarray(own <= _NOISE * whole[:, None])
 
 
 def knowledge(
