@@ -17,7 +17,7 @@ from plants import one_state, shipped
 from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
-from gpebo_cli import from_mechanics, run
+from gpebo_cli import from_mechanics, from_netlist, run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.sensors import _fall, candidates
@@ -465,6 +465,34 @@ def test_a_position_that_a_constraint_holds_is_known_whatever_is_measured():
     found = run(mechanism.mapping(), time={"horizon": 4, "samples": 21}).details.estimable
     assert {name for name in names if found[name] is not None} == {"still"}
     assert found["v_still"] == 0.0
+
+
+@pytest.mark.parametrize("observer", [
+    {"form": "given"}, {"form": "strangeness_free"}, {"sample_time": 0.05},
+])
+def test_what_has_decayed_and_is_determined_stays_so(observer):
+    """Of v = x' a known combination of the unknown ones is left, a difference of large terms."""
+    mapping = {
+        "name": "settling", "states": ["x", "v", "z"], "outputs": ["y"], "unknowns": {"load": 1.0},
+        "E": np.diag([1.0, 0, 1]), "A": [[0, 1, 0], [-6, -1, 0], [0, 1, -1]],
+        "F": [[0], [0.3], [0]], "C": [[0, 0, 1]], "initial_state": [1, 0, 0.3],
+    }
+    for horizon in (2, 3.5, 4.25, 5, 8):
+        result = run(mapping, observer=observer, time={"horizon": horizon, "samples": 21})
+        found = result.details.estimable
+        assert found["x"] is None
+        assert 0.0 < found["v"] <= horizon / 20 + 0.05 + 1e-9
+        assert abs(result.errors["v"][0, -1]) < 1e-9
+
+
+def test_a_voltage_that_is_given_tells_nothing_of_what_it_drives():
+    """Columns of psi are zero, and one of them is made of nothing at all."""
+    circuit = from_netlist(
+        "two parts\nV1 a 0 0.47\nR2 b a 0.6\nR3 c b 1.15\nR4 d 0 356\nR5 b 0 0.5\nR6 c 0 0.53\n"
+        "C7 c 0 0.58\nC8 d 0 0.96\n", measure="v(a)",
+    )
+    found = run(circuit.mapping(), time={"horizon": 4, "samples": 11}).details.estimable
+    assert [name for name, since in found.items() if since is not None] == ["a"]
 
 
 @pytest.mark.parametrize("seed", range(5))
