@@ -412,6 +412,29 @@ def test_at_most_eight_panels_and_it_says_so() -> None:
     assert figure.texts[0].get_text() == "8 of 30 shown"
 
 
+@pytest.mark.parametrize(("values", "log", "says"), [
+    ([1.0, 0.0, 0.0, 0.0], True, "zero but at single times"),
+    ([0.0, 1e-9, 0.0, 1e-9], True, "zero but at single times"),
+    ([0.0, 0.0, 0.0, 0.0], True, "zero throughout"),
+    ([np.nan, 0.0, np.nan, np.nan], True, "zero throughout"),
+    ([np.nan, 2.0, np.nan, 3.0], False, "no finite values but at single times"),
+    ([np.nan, np.nan, np.nan, np.inf], False, "no finite values"),
+    ([1.0, 1e-9, 0.0, 0.0], True, ""),
+    ([0.0, 0.0, 0.0, 0.0], False, ""),
+])
+def test_a_panel_in_which_nothing_is_seen_says_so(
+    values: list[float], log: bool, says: str
+) -> None:
+    def said(line: style.Line) -> list[str]:
+        curve = style.Curve(np.arange(4.0), np.array(values), "", line)
+        (axes,) = style.compose([style.Panel("x", (curve,), log=log)]).axes
+        return [text.get_text() for text in axes.texts]
+
+    line = style.line(0)
+    assert said(line) == ([says] if says else [])
+    assert said(replace(line, dots=True)) == ([says] if says and "single" not in says else [])
+
+
 def test_what_was_measured_is_drawn_if_any_of_it_is_not_the_truth() -> None:
     result = make_result(samples=11)
     measured = result.signals.outputs + np.eye(11)[:, :1]

@@ -17,7 +17,7 @@ from plants import one_state, shipped
 from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
 
-from gpebo_cli import run
+from gpebo_cli import from_mechanics, from_netlist, run
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.sensors import _fall, candidates
@@ -451,6 +451,63 @@ def test_a_parameter_that_another_can_stand_for_does_not_look_like_a_wrong_model
     fit = result.details.fit
     assert fit.residual[0] < 1e-3 * fit.size
     assert "missing or wrong parameter" not in result.verdict
+
+
+def test_a_position_that_a_constraint_holds_is_known_whatever_is_measured():
+    """All that is there of it is rounding; another constraint has it in it, too."""
+    names = ["left", "still", "right", "far", "on"]
+    mechanism = from_mechanics({
+        "M": np.diag([1.7, 0.33, 1.1, 2.5, 1.9]), "K": np.diag([12.3, 16.1, 8, 0.83, 11.5]),
+        "G": [[0, 0.82, 0, 0, 0], [-0.39, 0.8, -0.61, 0, 0]], "unknowns": {"a": 1.5, "b": 0.5},
+        "F": [[0.94, -1.06], [1.11, -0.62], [-1.01, 0.94], [-0.22, -0.39], [0.46, -0.1]],
+        "positions": names, "measure": ["v_far"],
+    }, "held")
+    found = run(mechanism.mapping(), time={"horizon": 4, "samples": 21}).details.estimable
+    assert {name for name in names if found[name] is not None} == {"still"}
+    assert found["v_still"] == 0.0
+
+
+@pytest.mark.parametrize("observer", [
+    {"form": "given"}, {"form": "strangeness_free"}, {"sample_time": 0.05},
+])
+def test_what_has_decayed_and_is_determined_stays_so(observer):
+    """Of v = x' a known combination of the unknown ones is left, a difference of large terms."""
+    mapping = {
+        "name": "settling", "states": ["x", "v", "z"], "outputs": ["y"], "unknowns": {"load": 1.0},
+        "E": np.diag([1.0, 0, 1]), "A": [[0, 1, 0], [-6, -1, 0], [0, 1, -1]],
+        "F": [[0], [0.3], [0]], "C": [[0, 0, 1]], "initial_state": [1, 0, 0.3],
+    }
+    for horizon in (2, 3.5, 4.25, 5, 8):
+        result = run(mapping, observer=observer, time={"horizon": horizon, "samples": 21})
+        found = result.details.estimable
+        assert found["x"] is None
+        assert 0.0 < found["v"] <= horizon / 20 + 0.05 + 1e-9
+        assert abs(result.errors["v"][0, -1]) < 1e-9
+
+
+def test_a_voltage_that_is_given_tells_nothing_of_what_it_drives():
+    """Columns of psi are zero, and one of them is made of nothing at all."""
+    circuit = from_netlist(
+        "two parts\nV1 a 0 0.47\nR2 b a 0.6\nR3 c b 1.15\nR4 d 0 356\nR5 b 0 0.5\nR6 c 0 0.53\n"
+        "C7 c 0 0.58\nC8 d 0 0.96\n", measure="v(a)",
+    )
+    found = run(circuit.mapping(), time={"horizon": 4, "samples": 11}).details.estimable
+    assert [name for name, since in found.items() if since is not None] == ["a"]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_state_that_no_parameter_has_part_in_is_no_doubt_in_any_unit(seed):
+    """Beside a kernel of G that leaves the others open, and zero as it is."""
+    rng = np.random.default_rng(seed)
+    psi, units = rng.normal(size=(9, 3)), 10.0 ** rng.uniform(-6, 6, 4)
+    psi[:, 2] = psi[:, 1]
+    gain = units[:, None] * rng.normal(size=(5, 4, 3))
+    gain[:, 1] *= 1e-17
+    offset = np.zeros((5, 4))
+    known = knowledge((psi.T @ psi)[None], np.ones(3), np.ones(1))
+    h = psi.T @ psi @ rng.normal(size=3)
+    told = known.states(gain, units)[-1] & known.resolved(h, offset, gain, 1.0, units)
+    assert told.tolist() == [False, True, False, False]
 
 
 @pytest.mark.parametrize("rate", [0.5, -0.5])

@@ -111,8 +111,11 @@ def test_every_key_is_explained():
         (["estimator", "ls_drem"], "ls_drem comes with gpebo"),
         (["estimator", "a", "--from", "a.cir"], "gpebo new estimator has a template of its own"),
         (["plant", "a", "--plant", "b"], "other kinds have no --plant"),
-        (["estimator", "a-b"], "a-b cannot be the name of a Python module"),
-        (["estimator", "random"], "random cannot be the name of a Python module"),
+        (["estimator", "a-b"], "a-b cannot be the name of a new Python module"),
+        (["estimator", "random"], "random cannot be the name of a new Python module"),
+        (["estimator", "numpy"], "no word of Python's and no module that is installed"),
+        (["observer", "pytest"], "pytest cannot be the name of a new Python module"),
+        (["observer", "gpebo_cli"], "gpebo_cli cannot be the name of a new Python module"),
     ],
 )
 def test_what_it_refuses(tmp_path, words, expected):

@@ -24,6 +24,8 @@ from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import Fit, NoiseStatistics
 from gpebo_cli.results import document, html
+from gpebo_cli.results.comparison import figures
+from gpebo_cli.results.finished import find
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.names import METRICS
 from gpebo_cli.results.report import case_table, estimate_table, noise_table
@@ -320,6 +322,19 @@ def test_plants_and_horizons_have_figures_of_their_own(inside):
     assert compare.main(["circuit", "other", "shorter", "--output", "compared"]) == 0
     names = {path.stem for path in (inside / "compared").glob("errors*.png")}
     assert names == {"errors_circuit_1", "errors_descriptor", "errors_circuit_2"}
+
+
+def test_figures_of_plants_in_subfolders_are_files_of_their_own(inside):
+    """A sweep chooses published/akzo, and that is no folder to write to."""
+    circuit, other = (found.cases[0] for name in ("circuit", "other") for found in find(name))
+    chosen = [
+        replace(case, chosen={**case.chosen, "plant": plant}) for case, plant in
+        ((circuit, "published/akzo"), (other, "published_akzo"), (other, "published/hires"))
+    ]
+    names = [name for name, _ in figures(chosen)]
+    assert names == [
+        "errors_published_akzo_1", "errors_published_akzo_2", "errors_published_hires"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from gpebo_cli.cli.options import CONFIG_DIR, Options, parse
@@ -148,18 +149,19 @@ def _check_name(kind: str, name: str, paths: list[Path]) -> None:
             f"digits, _ and - (80 at most), and none of {', '.join(_WORDS)}"
         )
     module = KINDS[kind] is _PACKAGE
-    taken = keyword.iskeyword(name) or name in sys.stdlib_module_names
+    for path in paths:
+        if path.exists() or path.is_symlink():
+            where = "another folder (--config-dir)" if module else "another name"
+            raise ConfigError(f"{path} exists already; remove it, or choose {where}")
+    # A module of the same name beside the test would hide one that is installed, even NumPy.
+    taken = keyword.iskeyword(name) or getattr(find_spec(name), "origin", None) is not None
     if module and (taken or not name.isidentifier()):
         raise ConfigError(
-            f"gpebo new {kind}: {name} cannot be the name of a Python module; it is a letter, then "
-            "letters, digits and _, and no word or module of Python's own"
+            f"gpebo new {kind}: {name} cannot be the name of a new Python module; it is a letter, "
+            "then letters, digits and _, no word of Python's and no module that is installed"
         )
     if name in choices(conf_folder(), _GROUPS.get(kind, kind)):
         raise ConfigError(
             f"gpebo new {kind}: {name} comes with gpebo, and yours would be ignored; choose "
             "another name"
         )
-    for path in paths:
-        if path.exists() or path.is_symlink():
-            where = "another folder (--config-dir)" if module else "another name"
-            raise ConfigError(f"{path} exists already; remove it, or choose {where}")

@@ -23,6 +23,7 @@ _DIGITS = 6  # of what a column has to say, by which one is preferred to another
 _SURE = 1e6  # times its level: an eigenvalue that decides which parameters are estimated
 _SEEN = 1e-6  # part in the kernel of N beyond which a direction is not known
 _NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what extensions are good to
+_CLEARED = 1e-11  # of its terms, what an observer clears of a gain
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
 _LOST = 1e-3  # of a state: a larger error leaves nothing of it that one would call known
 _HIDDEN = 10.0  # times what is seen of η is what may be hidden in the kernel of N
@@ -132,29 +133,34 @@ class Knowledge:
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
             return np.ones((len(kernel), gain.shape[1]), dtype=bool)
-        last = gain[len(gain) - len(kernel) :]
-        if units is not None:  # the row of a state that no parameter has part in is rounding
-            own = np.abs(gain)
-            own /= units[:, None]
-            whole = np.fmax.reduce(own, axis=1, initial=0.0)
-            whole = np.maximum.accumulate(whole)[-len(last) :, None]
-            last = np.where(own[-len(last) :] <= _NOISE * whole, 0.0, last)
-        scaled = last / self.sizes[:, None, :]
+        own = gain if units is None else np.where(_is_rounding(gain, units), 0.0, gain)
+        scaled, past = (
+            x[len(gain) - len(kernel) :] / self.sizes[:, None, :]
+            for x in (own, np.maximum.accumulate(np.abs(own)))
+        )
         left, size = (np.einsum("mnp,mnp->mn", x, x) for x in (scaled @ kernel, scaled))
-        return np.asarray(np.sqrt(left) <= slack[:, None] * np.sqrt(size))
+        # What is left of a difference of terms that were larger may be what observers clear.
+        off = _CLEARED * np.linalg.norm(past @ np.abs(kernel), axis=2)
+        return np.asarray(np.sqrt(left) <= slack[:, None] * np.sqrt(size) + off)
 
-    def resolved(self, h: Array, offset: Array, gain: Array, growth: float | None) -> BoolArray:
+    def resolved(
+        self, h: Array, offset: Array, gain: Array, growth: float | None,
+        units: Array | None = None,
+    ) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
 
-        Neither what the kernel of N leaves open, nor rounding, may amount to more than a thousandth
-        of them; a small ``growth`` of Φ explains no state that is smaller still beside its terms.
-        Of h = ∫ψᵀY at the end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN
-        where nothing is known.
+        That is so of one that no parameter has part in, even if it is zero. Neither what the kernel
+        of N leaves open, nor rounding, may amount to more than a thousandth of the others; a small
+        ``growth`` of Φ explains no state that is smaller still beside its terms. Of h = ∫ψᵀY at the
+        end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN where nothing is known;
+        ``units`` as for :meth:`states`.
         """
         small = (growth or 0.0) < LARGE
         if small and (self.clarity[-1] >= 1.0).all():
             return np.ones(gain.shape[1], dtype=bool)
         error, z = self.doubt(h, gain[-1])
+        if units is not None:
+            error[_is_rounding(gain, units).all(axis=(0, 2))] = 0.0
         size = np.abs(offset + gain @ z).max(axis=0)
         if small:
             size = np.maximum(size, np.abs(gain[-1]) @ np.abs(z) / LARGE)
@@ -178,6 +184,17 @@ class Knowledge:
         of_each = np.abs(row @ (told / spectrum[clear]) @ told.T) @ met
         error = unseen + _NOISE * (np.minimum(of_all, of_each) + np.abs(row) @ np.abs(z))
         return np.asarray(error), z / self.sizes[-1]
+
+
+def _is_rounding(gain: Array, units: Array) -> BoolArray:
+    """What of a gain (N, n, p) is rounding beside that of other states so far, in their units.
+
+    All of the row of a state is that no parameter has part in.
+    """
+    own = np.abs(gain)
+    own /= units[:, None]
+    whole = np.maximum.accumulate(np.fmax.reduce(own, axis=1, initial=0.0))
+    return np.asarray(own <= _NOISE * whole[:, None])
 
 
 def knowledge(

@@ -160,7 +160,8 @@ def visible(
         gain, offset, growth = state_map.gain(t), state_map.offset(t), observation.growth
         h = observation.regression.gram_final[:, observation.regression.p]
         return lambda known: (
-            known.states(gain, state_map.units) & known.resolved(h, offset, gain, growth)
+            known.states(gain, state_map.units)
+            & known.resolved(h, offset, gain, growth, state_map.units)
         )
     # What it needs of the parameters is not known: all of them.
     given = np.array([name not in observation.unseen for name in states], dtype=bool)

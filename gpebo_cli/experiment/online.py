@@ -177,7 +177,7 @@ class Online:
         self._last = block.offset[-1], block.gain[-1], block.fit
         if block.fit is None:
             h = self.root[:, :p].T @ self.root[:, p]
-            seen &= known.resolved(h, block.offset, gain, self.growth)
+            seen &= known.resolved(h, block.offset, gain, self.growth, block.units)
         self._final, self._seen = eta[:, -1].copy(), seen[-1].copy()
         self.largest = np.fmax(self.largest, np.abs(states).max(axis=(0, 1)))
         self._newest = t[_NEWEST], known.at(_NEWEST), eigenvalues[_NEWEST]

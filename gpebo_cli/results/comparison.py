@@ -96,7 +96,7 @@ def _comparable(cases: Sequence[Case]) -> dict[str, list[Case]]:
         groups.setdefault((case.chosen["plant"], spans[case.folder]), []).append(case)
     if len(groups) == 1:
         return {"": list(cases)}
-    plants = [plant for plant, _ in groups]
+    plants = [str(plant).replace("/", "_") for plant, _ in groups]  # published/akzo is no folder
     suffixes = (
         f"_{plant}" + (f"_{plants[:k].count(plant) + 1}" if plants.count(plant) > 1 else "")
         for k, plant in enumerate(plants)

@@ -328,15 +328,23 @@ def _fill(axes: Axes, panel: Panel, height: float) -> None:
             axes.plot(curve.x, curve.down_to, **curve.style.keywords)
             axes.fill_between(curve.x, curve.down_to, curve.y, color=curve.style.color,
                               alpha=0.15, linewidth=0.0)
-    if all(np.isnan(drawn(panel, curve)).all() for curve in panel.curves):
+    if not any(_is_seen(drawn(panel, curve), curve.style) for curve in panel.curves):
+        alone = any(np.isfinite(drawn(panel, curve)).any() for curve in panel.curves)
         finite = any(np.isfinite(curve.y).any() for curve in panel.curves)
-        said = "zero throughout" if finite else "no finite values"
+        said = "zero" if finite and panel.log else "no finite values"
+        said += " but at single times" if alone else " throughout" * (said == "zero")
         axes.text(0.5, 0.5, said, transform=axes.transAxes, ha="center", va="center")
     if panel.vertical is not None:
         time, label = panel.vertical
         axes.axvline(time, label=label.replace("t_c", "$t_c$"), **INSTANT.keywords)
     unit = _set_ticks(axes.yaxis, 5, panel.unit, log=panel.log)
     _set_name(axes, panel.text or escaped(panel.name), unit, height)
+
+
+def _is_seen(values: Array, style: Line) -> bool:
+    """Whether a curve (N,) leaves a mark: a point of a line between gaps does not."""
+    there = np.isfinite(values)
+    return bool(there.any() if style.dots else (there[1:] & there[:-1]).any())
 
 
 def _set_across(axes: Axes, panels: Sequence[Panel]) -> None:
