@@ -118,6 +118,14 @@ def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
         assert told == pytest.approx(where, abs=1e-8)
 
 
+def test_a_derivative_array_that_vanishes_at_the_start_is_told_as_such():
+    E, A = [["t", 0], [0, 0]], [[-1, 1], [1, 2]]
+    singular = plant(states=["a", "b"], E=E, A=A, initial_state=[1, 0])
+    said = r"rank of the derivative array changes near t = 0 \(singular value 0.0e\+00\)"
+    with pytest.raises(ModelError, match=said):
+        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+
+
 @pytest.mark.parametrize("bottom", [2e-10, 0.0])
 def test_singular_values_that_are_small_everywhere_are_followed_to_the_bottom(bottom):
     """Of many hidden constraints in units far apart they are 5e-8 at most: 2e-10 is no zero."""
