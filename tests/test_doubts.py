@@ -66,6 +66,22 @@ def test_how_far_estimates_are_off_least_squares_is_told_in_their_sizes():
     assert ("a, b, c, x are up to 0.2 " in warning) == (told["x"] < 0.2)
 
 
+@pytest.mark.parametrize(("size", "warned"), [(1e-12, False), (1e-3, True)])
+def test_a_state_that_is_zero_has_the_size_of_its_terms(size, warned):
+    """x = 2a + c/2 − that of least squares, with an error of 1e-3 in a: not 1e9."""
+    gain = np.array([2.0, 0.0, 0.5])
+
+    def zero(eta):
+        return (eta @ gain - gain @ LEAST + size)[:, None, None]
+
+    told, warnings = doubts.of_estimates(
+        ROOT, LEAST[None] + [1e-3, 0.0, 0.0], zero, zero, NAMES[:4],
+        np.array([2.0, 0.1, 5.0, size]), KNOWN, np.array([True]), np.arange(3),
+        required(True, gamma_times_integral=30.0),
+    )
+    assert (len(warnings), told["x"] < 1e-3) == (warned, not warned)
+
+
 @pytest.mark.parametrize(("left", "limit"), [
     (0.0, 0.02), (7.0, 0.02), (9.0, 30.0 * np.exp(-9.0)), (30.0, 1e-3),
 ])

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
-from scipy.integrate import cumulative_trapezoid, quad_vec, trapezoid
+from scipy.integrate import cumulative_trapezoid, quad_vec, solve_ivp, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
@@ -1147,3 +1147,45 @@ def test_persistent_excitation_is_asked_of_the_smallest_gain():
     )
     assert str(beside) == str(alone)  # its gain is nan
     assert str(beside) != str(estimate("gradient", CLEAN, gamma=8.0).requirement)
+
+
+@pytest.mark.parametrize("f0", [1e-2, 1e-4, 1e-7])
+def test_a_delta_that_rises_within_a_small_part_of_an_element_is_followed(f0):
+    """Δ = G/(f₀ + G) with G = t, and ∫Δ² in closed form: a cut in four alone tells nothing."""
+    found = gpebo_cli.run(
+        regression={"name": "steep", "unknowns": {"k": -1.84}, "psi": [["cos(t)"], ["sin(t)"]]},
+        estimator={"name": "ls_drem", "gamma": 10.0, "f0": f0}, time={"horizon": 2, "samples": 21},
+    )
+    t = found.t
+    energy = t - 2.0 * f0 * np.log1p(t / f0) + f0 - f0 * f0 / (f0 + t)
+    np.testing.assert_allclose(
+        found.errors["k"][0], 1.84 * np.exp(-10.0 * energy), rtol=1e-7, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("estimator", "gamma", "rate"), [
+    ("lion", 0.1, 0.022), ("drem", 10.0, 120.0), ("fct", 1e4, 3.0),
+])  # fmt: skip
+def test_what_disturbs_a_psi_of_next_to_nothing_does_not_move_estimates(estimator, gamma, rate):
+    """𝐘/Δ is 1e19 at first, and 1e40 behind the pulse, which has no weight in the law."""
+    pulse = "exp(-((t - 2)/0.3)**2)"
+    found = gpebo_cli.run(
+        regression={"name": "pulse", "unknowns": {"k": -2}, "psi": [[pulse]],
+                    "Y": [f"-2*{pulse} + 0.5*cos(5*t)"]},
+        estimator={"name": estimator, "gamma": gamma, "initial": [1.5], "lambda": rate},
+        time={"horizon": 5, "samples": 21},
+    )
+
+    def law(t, z):
+        psi = np.exp(-(((t - 2.0) / 0.3) ** 2))
+        own = 1.0 if estimator == "lion" else psi
+        Y = own * (-2.0 * psi + 0.5 * np.cos(5.0 * t))
+        return [rate * (own * psi - z[0]), rate * (Y - z[1]),
+                gamma * z[0] * (z[1] - z[0] * z[2]), gamma * z[0] ** 2]
+
+    z = solve_ivp(law, (0.0, 5.0), [0.0, 0.0, 1.5, 0.0], t_eval=found.t, method="LSODA",
+                  rtol=1e-10, atol=1e-13, max_step=0.05).y  # fmt: skip
+    expected, left = z[2], np.minimum(np.exp(-z[3]), 0.9)
+    if estimator == "fct":
+        expected = (expected - left * 1.5) / (1.0 - left)
+    np.testing.assert_allclose(found.estimates["k"][0], expected, atol=1e-6)

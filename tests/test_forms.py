@@ -247,6 +247,29 @@ def test_what_a_failure_of_assumption_1_does_not_touch_is_kept(plant, lost, unit
         run(plant, observer={"name": "gpebo", "form": "given", "remedy": "reset"})
 
 
+@settings(max_examples=4, deadline=None)
+@given(
+    where=st.floats(0.1, 2.9), first=st.sampled_from([0, 1]), follows=st.booleans(),
+    sees=st.sampled_from(["{} - {}", "{1} - {0}", "({0} - {1})**2"]),
+)
+def test_an_output_that_is_blind_at_one_time_alone_fails_assumption_1_there(
+    where, first, follows, sees
+):
+    """No node of the mesh need be there: next to it K has a pole, which elements may step over."""
+    plant = {
+        "name": "blind", "states": ["x", "z"], "inputs": {"u": "3*t"}, "outputs": ["y"],
+        "unknowns": {"k": 1}, "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, 0]], "B": [[1], [0]],
+        "phi": [0, "-cos(t)"], "F": [[1], [0]], "initial_state": [1, 0],
+        "C": [[first, sees.format("u/3" if follows else "t", where)]],
+    }
+    with pytest.raises(ModelError, match=r"fails at t = \S+: .*=strangeness_free") as caught:
+        run(plant, time={"horizon": 3}, observer={"name": "gpebo", "form": "given"})
+    assert float(str(caught.value).split("t = ")[1].split(":")[0]) == pytest.approx(where, abs=1e-3)
+    found = run(plant, time={"horizon": 3})
+    assert max(float(np.abs(found.errors[name][0, -1])) for name in "xz") < 1e-9
+    assert "fails at t" in found.verdict
+
+
 def test_the_states_are_those_in_closed_form():
     system = plant_from_mapping(CAPACITORS)
     result = run(CAPACITORS, estimator="ls_drem", time={"horizon": 10})

@@ -516,3 +516,25 @@ def test_times_far_from_zero_change_nothing(observer, start):
         return np.array([since, *(result.estimates[name][0, -1] for name in ("a", "b", "k"))])
 
     np.testing.assert_allclose(found(start), found(0.0), atol=1e-6)
+
+
+@pytest.mark.parametrize(("sees", "form"), [(3, "given"), (-3, "strangeness_free")])
+def test_auto_is_the_form_that_gpebo_takes(sees, form):
+    """Along the other sign of C the equations as given grow until they tell nothing of v."""
+    plant = {
+        "name": "p", "states": ["x", "v", "z"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": np.diag([1, 1, 0]).tolist(), "A": [[-1, 0, 4], [1, -1, 0], [1, 0, 0]],
+        "B": [[1], [0], [0]], "phi": [0, 0, "-cos(t)"], "C": [[sees, 1, 1]],
+        "initial_state": [1, 0.5, 0],
+    }
+    noise = {"name": "gaussian", "outputs": 0.01, "sample_time": 0.5}
+    own = {"time": {"horizon": 8, "samples": 5}, "noise": noise}
+    taken = {}
+    for observer in ("gpebo", "kalman_bucy"):
+        found = api_run(plant, observer=observer, **own)
+        (taken[observer],) = (
+            a.evidence["form"] for a in found.assumptions if a.name == "Assumption 1"
+        )
+    assert taken == dict.fromkeys(taken, form)
+    assert "not determined" not in found.verdict
+    assert ("tells with more digits" in found.verdict) == (form == "strangeness_free")

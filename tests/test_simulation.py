@@ -118,6 +118,14 @@ def test_a_rank_drop_is_found_wherever_the_probes_happen_to_be(where):
         assert told == pytest.approx(where, abs=1e-8)
 
 
+def test_a_derivative_array_that_vanishes_at_the_start_is_told_as_such():
+    E, A = [["t", 0], [0, 0]], [[-1, 1], [1, 2]]
+    singular = plant(states=["a", "b"], E=E, A=A, initial_state=[1, 0])
+    said = r"rank of the derivative array changes near t = 0 \(singular value 0.0e\+00\)"
+    with pytest.raises(ModelError, match=said):
+        simulate(singular, TimeSettings(horizon=1.0), SOLVER)
+
+
 @pytest.mark.parametrize("bottom", [2e-10, 0.0])
 def test_singular_values_that_are_small_everywhere_are_followed_to_the_bottom(bottom):
     """Of many hidden constraints in units far apart they are 5e-8 at most: 2e-10 is no zero."""
@@ -125,16 +133,17 @@ def test_singular_values_that_are_small_everywhere_are_followed_to_the_bottom(bo
     def values(t):
         return np.stack([np.ones_like(t), bottom + 1e-7 * np.abs(t - 0.3712), np.ones_like(t)], -1)
 
-    def lines(t, _, column):
+    def lines(t, column):
         return values(t).reshape(-1, structure._DIP_POINTS, 3)[range(len(column)), :, column]
 
     t = np.linspace(0.0, 1.0, 65)
-    arguments = plant(states=["a"], E=[[1]], A=[["sin(t)"]], initial_state=[1]), t, values(t)
+    one = plant(states=["a"], E=[[1]], A=[["sin(t)"]], initial_state=[1])
+    changes = partial(structure._rank_changes, one)
     if bottom:
-        assert not structure._follow_dips(*arguments, 0, 1e-10, lines)
+        assert not structure.follow_dips(t, values(t), 1e-10, lines, changes)
     else:
         with pytest.raises(ModelError, match=r"rank of the constraints changes at t = 0\.371"):
-            structure._follow_dips(*arguments, 0, 1e-10, lines)
+            structure.follow_dips(t, values(t), 1e-10, lines, changes)
 
 
 def test_a_rank_drop_is_found_beside_a_fast_rate():

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from gpebo_cli import run, simulation
-from gpebo_cli.errors import ConfigError, GpeboError, SolverError
+from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
 from gpebo_cli.model.functions import Names, system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -416,6 +416,23 @@ def test_what_is_refused_beyond_the_end_of_a_solution_is_not_its_reason():
     said = r"beyond t = 0\.9999\d+ .* there\): Newton's method does not converge"
     with pytest.raises(SolverError, match=said):
         simulate(system, TimeSettings(horizon=3.0), SOLVER)
+
+
+@pytest.mark.parametrize(("plant", "at", "rank"), [
+    ({"E": [[1, "t"], ["t", 1]], "A": [["-1-y**2", 1], [1, 2]]}, 1.0, "derivative array"),
+    ({"E": [["cos(t)", 0.1], [0, 0]], "A": [["-1-y**2", 1], [1, 2]]}, np.arccos(0.05),
+     "differential part"),
+])  # fmt: skip
+def test_a_rank_that_changes_where_the_solution_ends_is_its_reason(plant, at, rank):
+    """The last windows before it are so short that Newton's method fails for another reason."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "z"], "outputs": ["y"], "C": [[1, 0]],
+        "initial_state": [1, 0], **plant,
+    })
+    said = rf"beyond t = \S+ .* the rank of the {rank} changes at t = (\S+) "
+    with pytest.raises(ModelError, match=said) as caught:
+        simulate(system, TimeSettings(horizon=5.0), SolverSettings(max_seconds=4.0))
+    assert float(re.search(said, str(caught.value))[1]) == pytest.approx(at, abs=1e-5)
 
 
 @pytest.mark.parametrize(("half", "then", "slows"), [

@@ -44,6 +44,9 @@ MAX_ELEMENTS = 20_000
 _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one of 𝐘/Δ
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
+_BESIDE = 1e5  # times η̂: 1e-10 of it is left of its digits beside such an η̄
+_BLIND = 1e-6  # tail of Δ² that is more than rounding, whatever a cut has made of it
+_ONE = np.ones(1)
 _STRETCH = 2048  # elements that are refined together: memory does not grow with the horizon
 _LANES = 1 << 22  # numbers in one batch of gains
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
@@ -130,8 +133,10 @@ class ScalarPath:
 
     @property
     def clearest(self) -> Array:
-        """η̄ (p,) where it is known to the most digits."""
-        return np.asarray(self.quotient[np.unravel_index(self.digits.argmax(), self.digits.shape)])
+        """η̄ (p,) where it is known to the most digits, or half of them, and has the most weight."""
+        clear = self.digits >= 0.5 * self.digits.max()
+        best = np.where(clear, self.weight, -1.0).argmax()
+        return np.asarray(self.quotient.reshape(clear.size, -1)[best])
 
     def comparable(self, units: Array | float) -> ScalarPath:
         """The same of parameters in units (p,), in which they are comparable."""
@@ -159,9 +164,12 @@ def scalar_law(
         return start[:, None].repeat(len(path.t), axis=1)
     seen, own = path.comparable(units), start / units
     variation, size = _variation(seen, float(gains.max(initial=0.0)), own)
+    # Beside an η̄ of no weight that is larger, such as noise over a Δ of next to nothing, the
+    # closed forms would lose η̂.
+    known = np.abs(seen.quotient).max(initial=0.0) <= _BESIDE * size
     if variation <= _CONSTANT * size and not _drifts(seen, float(gains.max()), size):
         return constant_law(path, start, gains)
-    if variation <= _SMALL * size:
+    if variation <= _SMALL * size and known:
         return linear_law(path, start, gains)
     elements = min(path.mesh.size, _STRETCH)
     lanes = elements * path.mesh.points.shape[1] * path.quotient.shape[2] * path.mesh.rule.stages
@@ -180,12 +188,15 @@ def scalar_law(
 def _variation(path: ScalarPath, gain: float, start: Array) -> tuple[float, float]:
     """How much η̄ varies from a point to the next, weighted by what that can do, and the size of η̂.
 
-    The weight is the share min(1, γδI) of a step of I that η̂ goes to meet η̄. Where the variation
-    is more than nothing, what is rounding of 𝐘/Δ does not count.
+    The weight is the share min(1, γδI) of a step of I that η̂ goes to meet η̄, and the size what
+    follows |η̄| by the law. Where the variation is more than nothing, what is rounding of 𝐘/Δ does
+    not count.
     """
     quotient = path.quotient
-    size = max(np.abs(path.clearest).max(initial=0.0), np.abs(start).max(), path.floor)
     length = np.maximum(path.energy[:, 1:] - path.energy[:, :-1], 0.0)
+    going, own = np.expm1(-gain * length.ravel()), np.abs(quotient).max(axis=2)
+    met = -going * np.maximum(own[:, 1:], own[:, :-1]).ravel()
+    size = max(affine_scan(1.0 + going, met, np.abs(start).max()).max(), path.floor)
     weight = np.minimum(1.0, gain * length)[..., None]
     change = np.abs(quotient[:, 1:] - quotient[:, :-1])
     much = (weight * change > _CONSTANT * size).any(axis=(1, 2))
@@ -376,12 +387,15 @@ def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
     before: Array | float = np.inf  # what was lost in the element that each one was cut from
     while True:
         mesh, begin = path.mesh, path.energy[:, 0]
-        size = np.maximum(path.weight.max(axis=1), np.finfo(float).tiny)[:, None]
-        tail = mesh.steps * legendre_tail(path.weight[..., None], mesh.rule, size)[:, 0]
+        size = np.maximum(path.weight.max(axis=1), np.finfo(float).tiny)
+        share = legendre_tail(path.weight[..., None] / size[:, None, None], mesh.rule, _ONE)[:, 0]
         gain = np.clip(1.0 / np.maximum(begin, np.finfo(float).tiny), least, most)
-        lost = gain * tail * np.exp(-gain * begin)
-        # A quarter of an element has a quarter of what is rounding, and much less of what is not.
-        poor = (lost > _TOLERANCE) & (lost < 0.05 * before)
+        lost = gain * mesh.steps * size * share * np.exp(-gain * begin)
+        # A quarter of an element has a quarter of what is rounding, and much less of what is not,
+        # if the element is not far too long for what is in it.
+        rounding = _SLACK * _ROUNDING / np.maximum(path.digits.max(axis=1), _ROUNDING)
+        poor = (lost < 0.05 * before) | (share > np.maximum(_BLIND, rounding))
+        poor &= lost > _TOLERANCE
         if not poor.any() or mesh.size > MAX_ELEMENTS:
             return path
         parts = np.where(poor, 4, 1)

@@ -18,9 +18,10 @@ _DONE = 30.0  # times this is what it has left of the errors it began with
 _BEYOND = 4.0  # deviations: noise does not bring estimates farther away
 UNFINISHED = (  # why there are no deviations
     "what the estimator needs is not met, and estimates are farther from least squares over the "
-    "same data than noise brings them; use estimator=least_squares or other gains"
+    "same data than noise brings them; use estimator=least_squares with a small f0, or other gains"
 )
 WORSE = 3.0  # times the residual of least squares: more than that is not the noise of the data
+_ZERO = 1e-9  # of its terms: a state that is less is zero, and as large as they are
 _TINY = float(np.finfo(float).tiny)
 _STILL = 1e-9  # of what would explain Y alone: one that moved by less was not moved by data
 
@@ -107,6 +108,8 @@ def of_estimates(
     own = np.append(np.abs(eta), np.abs(x[1]).max(axis=0, initial=0.0))
     own = np.maximum(np.fmax(sizes, own), _TINY)
     gain = np.concatenate([np.eye(p), (rows[:-1] - rows[-1]).T])
+    terms = np.abs(gain) @ np.abs(eta) + np.append(np.zeros(p), np.abs(rows[-1]))
+    own = np.where(own > _ZERO * terms, own, terms)
     away, open_ = np.abs(one - other), known.doubt(root[:, :-1].T @ root[:, -1], gain)[0]
     determined = np.append(known.parameters[-1], seen)
     found = dict(zip(quantities, ((away + open_) / own).tolist(), strict=True))
@@ -123,6 +126,7 @@ def of_estimates(
         f"estimates.csv: at the end {', '.join(compress(quantities, far))} are up to "
         f"{(away / own)[far].max():.2g} of their size away from least squares over the same data, "
         f"which leaves {least / size:.1g} of Y and they {np.hypot(least, more[best]) / size:.1g}: "
-        "the estimator has lost digits or is not done; use estimator=least_squares or other gains"
+        "the estimator has lost digits or is not done; use estimator=least_squares with a small "
+        "f0, or other gains"
     )
     return told, (text,)

@@ -47,12 +47,12 @@ from gpebo_cli.observers._base import (
 )
 from gpebo_cli.observers._observability import WindowGramians, window_gramians
 from gpebo_cli.observers._riccati import Filtered, StateSpace, filter_windows, pair
-from gpebo_cli.observers.reduced.condensed import beyond, lean, thinned
+from gpebo_cli.observers.gpebo import Gpebo
+from gpebo_cli.observers.reduced.condensed import beyond, thinned
 from gpebo_cli.observers.reduced.matrices import ObserverMatrices
 from gpebo_cli.observers.reduced.split import Split, units_along
 from gpebo_cli.observers.reduced.system import SMALL, ReducedSystem, reduced_system
 from gpebo_cli.observers.remedies.current_coordinates import CurrentState
-from gpebo_cli.observers.remedies.plain import Plain
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found
@@ -224,16 +224,16 @@ class KalmanBucy:
             signals = replace(signals, asked=None)
             signals.check_memory(system, _HELD)
 
-        def reduced_on(signals: Measurements) -> ReducedSystem:
-            return reduced_system(system, signals, solver, xi_a0=self.xi_a0, form=self.form)
-
-        evidence = lean(lambda each: Plain().observe(reduced_on(each)), system, signals, solver)
+        evidence = Gpebo(form=self.form, xi_a0=self.xi_a0).observe(system, signals, solver)
+        form = next(str(a.evidence["form"]) for a in evidence.assumptions if "form" in a.evidence)
         few = thinned(system, _with_pauses(signals), solver)
-        known = reduced_on(replace(few or signals, wanted=None))
+        known = reduced_system(
+            system, replace(few or signals, wanted=None), solver, xi_a0=self.xi_a0, form=form
+        )
         mesh, q, split = known.mesh, system.q, known.first.split
         windows = [mesh] if few or signals.asked is None else mesh.windows()
         noise, level = _noise(signals, system, evidence)
-        note = known.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
+        note = evidence.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
         unknown = noise.rows is not None and not noise.variances.any()
         steps = _steps(noise, mesh)
 

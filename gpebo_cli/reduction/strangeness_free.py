@@ -220,10 +220,10 @@ def _by_singular_vectors(
     bad = zero | (sigma[:, r - 1] <= tol * size) if r else zero
     if bad.any():
         k = int(np.argmax(bad))
-        value = sigma[k, r] if zero[k] else sigma[k, r - 1]
+        value = (sigma[k, r] if zero[k] else sigma[k, r - 1]) / (size[k] or 1.0)
         raise ModelError(
             f"{who(system)}: the rank of the derivative array changes near t = {t[k]:.9g} "
-            f"(singular value {value / size[k]:.1e}); choose a horizon that avoids this time"
+            f"(singular value {value:.1e}); choose a horizon that avoids this time"
         )
     Z2 = U[:, :, r:]
     T2 = transpose(np.linalg.svd(transpose(Z2) @ N)[2])[:, :, a:]

@@ -150,7 +150,10 @@ def _analysed(
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
         if not invariant:
-            steady = _follow_dips(system, t, levels.smallest, mu, rank_tol, partial(_lines, found))
+            steady = follow_dips(
+                t, levels.smallest, rank_tol, partial(_lines, system, found),
+                partial(_rank_changes, system),
+            )
             found = replace(found, steady=steady)
         if not levels.a and "E" not in system.coefficients.constant:
             _refuse_crossing(system, t, c.E[0])
@@ -201,9 +204,9 @@ def _in_stages(
         e, a = scaled(c.E, c.A, s.rows, s.columns, s.time, mu + 1)
         return in_stages(e, a, np.zeros((mu + 1, 1, system.n, 0)), rank_tol, 1, ranks)
 
-    def lines(t: Array, c: Coefficients, column: IntArray) -> Array:
+    def lines(t: Array, column: IntArray) -> Array:
         try:
-            smallest = found(c).smallest
+            smallest = found(system.coefficients.taylor(t, mu)).smallest
         except UnclearError as unclear:  # everything is clear away from there
             raise unclear_ranks(system, t, UnclearError(unclear.place)) from unclear
         lines = smallest.reshape(-1, _DIP_POINTS, 4)[range(len(column)), :, column]
@@ -228,7 +231,9 @@ def _in_stages(
         mu += 1
     ranks, largest = stages.ranks, float(stages.smallest[:, 3].max())
     stages.smallest[:, 3] /= largest
-    steady = len(t) == 1 or _follow_dips(system, t, stages.smallest, mu, rank_tol, lines)
+    steady = len(t) == 1 or follow_dips(
+        t, stages.smallest, rank_tol, lines, partial(_rank_changes, system)
+    )
     none, n, a = np.zeros(0, dtype=np.intp), system.n, stages.A2.shape[1]
     E, A = (matrix[0] * (s.rows[:, None] * s.columns) for matrix in (c.E, c.A))
     W1 = transpose(stages.Z1)
@@ -428,11 +433,23 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
     )
 
 
-def _follow_dips(
-    system: DescriptorSystem, t: Array, smallest: Array, mu: int, rank_tol: float,
-    lines: Callable[[Array, Coefficients, IntArray], Array],
+def _rank_changes(system: DescriptorSystem, column: int, t: float, value: float) -> ModelError:
+    """What is said of a decisive singular value that ends at zero."""
+    name = ("derivative array", "constraints", "differential part", "constraints")[column]
+    return ModelError(
+        f"{who(system)}: the rank of the {name} changes at t = {t:.9g} (singular value "
+        f"{value:.1e}); choose a horizon that avoids this time"
+    )
+
+
+def follow_dips(
+    t: Array, smallest: Array, rank_tol: float, lines: Callable[[Array, IntArray], Array],
+    refusal: Callable[[int, float, float], ModelError],
 ) -> bool:
-    """Follow local minima of the decisive singular values (N, 3); whether there is none inside.
+    """Follow local minima of decisive singular values (N, columns); whether there is none inside.
+
+    ``lines`` are those of the columns (D,) at times one grid for each after the other, (D, points);
+    the ``refusal`` is of a column, at a time, with a value that is zero.
 
     A rank that drops at an isolated time is never hit by a grid: |sin t| is 1e-2 at the nearest
     probe and looks harmless. Each deep local minimum is bracketed and cut by 8 per round, for as
@@ -443,7 +460,6 @@ def _follow_dips(
     steady, dips = _dips(smallest)
     if not dips:
         return steady
-    names = ("derivative array", "constraints", "differential part", "constraints")
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
     lowest, zero = smallest[k, column], np.maximum(rank_tol, 1e-9 * smallest.max(axis=0))
@@ -452,8 +468,7 @@ def _follow_dips(
             break
         grid = left[:, None] + (right - left)[:, None] * _CUTS
         grid[:, -1] = right
-        c = system.coefficients.taylor(grid.ravel(), mu)
-        values = lines(grid.ravel(), c, column)
+        values = lines(grid.ravel(), column)
         dip, best = np.arange(len(values)), values.argmin(axis=1)
         before, after = np.maximum(best - 1, 0), np.minimum(best + 1, _DIP_POINTS - 1)
         value = values[dip, best]
@@ -461,11 +476,7 @@ def _follow_dips(
         lost = lowest <= zero[column]
         if lost.any():
             i = int(np.argmax(lost))
-            where = grid[i, best[i]]
-            raise ModelError(
-                f"{who(system)}: the rank of the {names[column[i]]} changes at t = {where:.9g} "
-                f"(singular value {lowest[i]:.1e}); choose a horizon that avoids this time"
-            )
+            raise refusal(int(column[i]), float(grid[i, best[i]]), float(lowest[i]))
         falls = value < 0.5 * np.maximum(values[dip, before], values[dip, after])
         left, right = grid[dip, before][falls], grid[dip, after][falls]
         column, lowest = column[falls], lowest[falls]
@@ -475,13 +486,15 @@ def _follow_dips(
 _CUTS = np.linspace(0.0, 1.0, _DIP_POINTS)
 
 
-def _lines(structure: Structure, _: Array, c: Coefficients, column: IntArray) -> Array:
+def _lines(
+    system: DescriptorSystem, structure: Structure, t: Array, column: IntArray
+) -> Array:
     """Columns (D,) of the levels that belong to the constraints there are, (D, points).
 
-    The times of c are those of one grid for each, one after the other. Bounds of them from below
-    serve as well, where none of them comes near zero.
+    Bounds of them from below serve as well, where none of them comes near zero.
     """
     s, rank_tol = structure.scaling, structure.rank_tol
+    c = system.coefficients.taylor(t, structure.mu)
     model = s.rows, s.columns, s.time, structure.mu + 1
     bounds, left, _ = kernels.structure.bounds(c.E, c.A, *model, *structure.reference)
     lines = bounds.reshape(-1, _DIP_POINTS, 3)[range(len(column)), :, column]

@@ -17,7 +17,7 @@ from typing import cast
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError, GpeboError, SolverError
+from gpebo_cli.errors import ConfigError, GpeboError, ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined, signal_scale
 from gpebo_cli.numerics.radau import radau_rule
@@ -77,19 +77,22 @@ def follow(
     begin, spent = process_time(), list[tuple[float, float]]()
     while t < stop - 1e-12 * time.horizon:
         spent.append((process_time() - begin, t))
-        _refuse_slow(system, time, spent, solver.max_seconds)
+        # What has a name there is the reason: no value, a zero divisor, a rank, a jump.
+        named = refused if t <= refused_until <= t + _AROUND * time.horizon else None
+        try:
+            _refuse_slow(system, time, spent, solver.max_seconds)
+        except SolverError as error:
+            raise (_ends(system, t, x, named) if named else error) from None
         length = stop - t if stop - t < 1.25 * length else length
         own, window = replace(system, initial_state=x), replace(time, start=t, horizon=length)
         try:
             piece, count, solves, last = _window(own, window, solver, solve)
         except GpeboError as error:
-            if isinstance(error, ConfigError | SlidesError):
-                refused, refused_until = error, t + length
+            if isinstance(error, ConfigError | ModelError | SlidesError):
+                refused, named, refused_until = error, error, t + length
             length *= 0.25
             if length < _SHORTEST * time.horizon:
-                # What has a name there is the reason: no value, a zero divisor, a jump.
-                near = refused is not None and t <= refused_until <= t + _AROUND * time.horizon
-                raise _ends(system, t, x, refused if near and refused else error) from None
+                raise _ends(system, t, x, named or error) from None
             continue
         pieces.append(piece)
         iterates, work = iterates + count, work + solves * length / time.horizon

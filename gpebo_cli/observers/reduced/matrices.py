@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from gpebo_cli.observers.reduced.split import (
 )
 from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
 from gpebo_cli.reduction.scaling import Units
+from gpebo_cli.reduction.structure import follow_dips
 from gpebo_cli.regression.errors import ErrorSystem
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
@@ -346,13 +348,39 @@ def _eliminate(
         bound[doubtful] = smallest
         if (smallest <= rank_tol).any():
             k = int(np.argmax(smallest <= rank_tol))
-            raise NotObservableError(
-                f"plant {system.name}: Assumption 1 (impulse observability) fails at "
-                f"t = {t[doubtful[k]]:.6g}: [ΠA; C] has singular value {smallest[k]:.1e} on the "
-                "kernel of E; an output that sees the algebraic states is needed, or "
-                "observer.form=strangeness_free"
-            )
+            raise _not_observable(system, 0, t[doubtful[k]], smallest[k])
     return Q1, kernel @ inverse, bound
+
+
+def _not_observable(
+    system: DescriptorSystem, _: int, t: float, smallest: float
+) -> NotObservableError:
+    """What is said where the singular value behind Assumption 1 is zero."""
+    return NotObservableError(
+        f"plant {system.name}: Assumption 1 (impulse observability) fails at t = {t:.6g}: [ΠA; C] "
+        f"has singular value {smallest:.1e} on the kernel of E; an output that sees the algebraic "
+        "states is needed, or observer.form=strangeness_free"
+    )
+
+
+def refuse_between(
+    form: EquationForm, found: ObserverMatrices, t: Array, rank_tol: float,
+    along: Callable[[Array, Array], Array] | None,
+) -> None:
+    """Refuse Assumption 1 that fails between the times t (N,) of the matrices found.
+
+    ``along`` tells [u; y] (N, m + r) at any times t (N,), of those inside of elements.
+    """
+    def lines(times: Array, column: IntArray) -> Array:
+        grid = times.reshape(len(column), -1)
+        inside = (grid + 1e-3 * (grid.mean(axis=1, keepdims=True) - grid)).ravel()
+        signals = along(times, inside) if along else None
+        more = observer_matrices(form, times, inside, rank_tol, found, signals=signals)
+        return more.injectivity.reshape(grid.shape)
+
+    if len(found.injectivity) > 1:
+        refusal = partial(_not_observable, form.system)
+        follow_dips(t, found.injectivity[:, None], rank_tol, lines, refusal)
 
 
 def _eliminate_in_part(

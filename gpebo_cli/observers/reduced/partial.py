@@ -70,7 +70,7 @@ def untouched(
         driven = sizes > _DRIVEN * max(float(np.linalg.norm(drive @ kernel)), TINY)
         if not driven.any():
             lost = (np.linalg.norm(free, axis=2) > _DRIVEN).any(axis=0)
-            if lost.all():
+            if lost.all() or not lost.any():
                 return None
             return _as_written(left, left_over, states, units.states), lost
         given_up = np.hstack([given_up, kept @ U[:, driven]])

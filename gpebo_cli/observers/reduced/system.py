@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from gpebo_cli.observers.reduced.matrices import (
     NotObservableError,
     ObserverMatrices,
     observer_matrices,
+    refuse_between,
 )
 from gpebo_cli.observers.reduced.partial import untouched
 from gpebo_cli.observers.reduced.split import initial_basis, units_along
@@ -183,12 +184,12 @@ def reduced_system(
     mesh = signals.mesh
     t, inside = mesh.points.ravel(), mesh.inside.ravel()
     signals.check_memory(system)
-    at = signals.at(t, inside, system) if system.coefficients.signals else None
-    lost = None
+    along = partial(signals.at, system=system) if system.coefficients.signals else None
+    at, lost = along(t, inside) if along else None, None
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights, units,
-            piecewise=system.n <= SMALL and len(mesh.windows()) > 1,
+            piecewise=system.n <= SMALL and len(mesh.windows()) > 1, along=along,
         )
     except NotObservableError as error:
         used = EquationForm.given(system, signals.derivatives, t, inside, at)
@@ -215,16 +216,17 @@ def choose_form(
     system: DescriptorSystem, t: Array, inside: Array, signals: Array | None,
     derivatives: InputDerivatives | None, solver: SolverSettings, form: str,
     weights: ByName | None, units: Units | None = None, *, piecewise: bool = False,
-    ahead: float = 1.0,
+    ahead: float = 1.0, along: Callable[[Array, Array], Array] | None = None,
 ) -> tuple[EquationForm, ObserverMatrices, str]:
     """The form of the equations, its matrices at the times t (N,), and why it is this one.
 
     The first time is that of the start. A plant whose matrices follow signals needs [u; y]
-    (N, m + r) there, and hidden constraints the derivatives of inputs, as far as they are known;
-    of a single time the structure is judged by the plant over the seconds ``ahead``. ``units`` are
-    those in which everything counts; None: of the plant at the start. ``piecewise`` the matrices
-    are looked at piece by piece, and those of the first times do, unless E moves (ConfigError: a
-    regression, no outputs, wrong weights, a derivative of an input that is not known).
+    (N, m + r) there, which ``along`` knows in between, and hidden constraints the derivatives of
+    inputs, as far as they are known; of a single time the structure is judged by the plant over the
+    seconds ``ahead``. ``units`` are those in which everything counts; None: of the plant at the
+    start. ``piecewise`` the matrices are looked at piece by piece, and those of the first times do,
+    unless E moves (ConfigError: a regression, no outputs, wrong weights, a derivative of an input
+    that is not known).
     """
     if system.regression is not None:
         raise ConfigError(
@@ -239,10 +241,13 @@ def choose_form(
 
     def matrices(chosen: EquationForm) -> ObserverMatrices:
         def at(part: slice, like: ObserverMatrices | None = None) -> ObserverMatrices:
-            return observer_matrices(
+            found = observer_matrices(
                 chosen, t[part], inside[part], solver.rank_tol, like, output_scale=scale,
                 signals=None if signals is None else signals[part],
             )
+            if chosen.structure is None:
+                refuse_between(chosen, found, t[part], solver.rank_tol, along)
+            return found
 
         if not piecewise or chosen.structure or "E" not in system.coefficients.constant:
             return at(slice(None))
