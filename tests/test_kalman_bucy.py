@@ -536,3 +536,15 @@ def test_times_far_from_zero_change_nothing(observer, start):
         return np.array([since, *(result.estimates[name][0, -1] for name in ("a", "b", "k"))])
 
     np.testing.assert_allclose(found(start), found(0.0), atol=1e-6)
+
+
+def test_rounding_of_what_constraints_say_is_not_resolved():
+    """c a + s b rests at 0, while the input makes −s a + c b as large as 1e8."""
+    c, s = np.cos(2.0), np.sin(2.0)
+    result = api_run(
+        {"name": "resting", "states": ["a", "b"], "inputs": {"u": "sin(3*t)"}, "outputs": ["y"],
+         "E": [[c, s], [0, 0]], "A": [[-c, -s], [-s, c]], "B": [[0], [1e8]],
+         "C": [[1, 0.2]], "initial_state": [0, 0]},
+        observer="kalman_bucy", solver={"max_elements": 200}, time={"horizon": 10, "samples": 51},
+    )
+    assert np.abs(result.details.estimation.parameters).max() < 1e-6
