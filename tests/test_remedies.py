@@ -22,6 +22,7 @@ from regressions import regression as make_regression
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, sqrtm
 from test_observer import ROTATING
+from units import Units, in_units
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
@@ -267,6 +268,22 @@ def test_a_kernel_that_rotates_leaves_the_papers_regression_its_outputs(remedy):
     assert relative_error(result)[-1] < 1e-6
     rows = 8 if remedy == "current_coordinates" else 4
     assert result.regression.psi.shape[1] == rows
+
+
+def test_that_a_kernel_has_no_part_in_w_weighs_as_much_as_outputs_do():
+    """Rows c Q w = 0 of a projector Q in comparable units; c is as large as ψ is at first."""
+    plant = {**ROTATING, "initial_state": dict.fromkeys(ROTATING["states"], 0.0)}
+    given = Units(10.0 ** np.array([3, 0, -4, 1]), *map(np.ones, (1, 1, 1, 4)), 1.0)
+    _, observation = along(
+        plant_from_mapping(in_units(plant, given)), 5.0, remedy="current_coordinates"
+    )
+    t, regression = np.linspace(0.0, 5.0, 11), observation.regression
+    psi = regression.psi(t) * regression.dynamics.units
+    size = np.trace(psi[0, :4, 1:]) / 2.0
+    Q = psi[:, :4, 1:] / size
+    np.testing.assert_allclose(Q @ Q, Q, atol=1e-12)
+    assert not psi[:, :4, 0].any()
+    assert 1.0 <= size / np.abs(psi[0, 4:]).max() < 3.0
 
 
 @pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
