@@ -289,9 +289,19 @@ FOLLOWING = {  # index 1: no output is differentiated
 }
 
 
+# A mass on a guide that an unknown moves: constraints say p and v at the start, beside it.
+GUIDED = {
+    "name": "guided", "states": ["p", "v", "force", "z"], "inputs": {"u": "0.2 + sin(2*t)"},
+    "unknowns": {"k": 0.7}, "outputs": ["y"], "E": np.diag([1, 1, 0, 1]).tolist(),
+    "A": [[0, 1, 0, 0], [-1, -0.3, 1, 0], [1, 0, 0, 0], [0, 1, 0, -0.5]],
+    "B": [[0], [0], [-0.4], [0]], "F": [[0], [0], ["-cos(t)"], [0]], "C": [[0, 0, 1, 0.5]],
+    "initial_state": [0, 0, 0, 1],
+}
+
+
 @pytest.mark.parametrize("form", ["given", "strangeness_free"])
 @pytest.mark.parametrize("plant", [
-    *map(measured, CONSTRAINED), FOLLOWING, ROTATING, shipped("circuit"), shipped("descriptor"),
+    *map(measured, [*CONSTRAINED, GUIDED]), FOLLOWING, ROTATING, shipped("circuit"), shipped("descriptor"),
 ], ids=lambda p: p["name"] if isinstance(p, dict) else p.name)
 def test_both_forms_find_the_truth_where_both_exist(plant, form):
     found, error, of_states = observed(plant, 5.0, form=form)
