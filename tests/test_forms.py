@@ -808,6 +808,20 @@ def test_a_failure_of_assumption_1_keeps_nothing_where_no_state_is_told_at_all_t
         observe(system, Measurements(u, y), form="given")
 
 
+@pytest.mark.parametrize("size", ["1", "exp(-20*t)"])
+def test_assumption_1_fails_at_the_time_that_is_named(size):
+    """0 = a + size (t − 2) v: v is told at any other time, however small its factor."""
+    system = plant_from_mapping({
+        "name": "once", "states": ["a", "v"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [1, f"{size}*(t - 2)"]], "C": [[1, 0]], "initial_state": [0, 0],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    u, y = (Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1))
+    told = r"Assumption 1 .* fails at t = 2: .* singular value 0\.0e\+00 .*form=strangeness_free"
+    with pytest.raises(ModelError, match=told):
+        observe(system, Measurements(u, y), form="given")
+
+
 @pytest.mark.parametrize("share", [1.0, 0.7])
 def test_nothing_is_given_up_for_rounding_where_assumption_1_fails(share):
     """v drives a and b, but not share a − b, which obeys an equation of its own."""
