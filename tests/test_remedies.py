@@ -32,6 +32,7 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
@@ -284,6 +285,23 @@ def test_that_a_kernel_has_no_part_in_w_weighs_as_much_as_outputs_do():
     np.testing.assert_allclose(Q @ Q, Q, atol=1e-12)
     assert not psi[:, :4, 0].any()
     assert 1.0 <= size / np.abs(psi[0, 4:]).max() < 3.0
+
+
+@pytest.mark.parametrize("swings", [0, 1, 2])
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_the_dynamics_of_current_coordinates_are_resolved_in_any_unit_of_time(swings, unit):
+    """D_0, A_0 or b_0 along signals that rest: nothing else asks for elements."""
+    w, size = 20.0 / unit, np.array([0.02, -0.1, 0.05]) / unit
+    texts = [f"{c!r}*(2 + {k == swings:d}*sin({w!r}*t))" for k, c in enumerate(size.tolist())]
+    system = plant_from_mapping(one_state(
+        A=[[texts[1]]], unknowns={"k": 0}, F=[[texts[0]]], inputs={"u": 1}, B=[[texts[2]]],
+    ))
+    mesh = initial_mesh(0.0, 2.0 * unit, [], 1, radau_rule(5))
+    u, y = (Trajectory(mesh, np.full((1, 6, 1), value)) for value in (1.0, 0.0))
+    found = observe(system, Measurements(u, y), remedy="current_coordinates").regression.dynamics
+    t = np.linspace(0.0, 2.0 * unit, 99)[:, None]
+    expected = size * (2.0 + (np.arange(3) == swings) * np.sin(w * t))
+    np.testing.assert_allclose(found.rows(t[:, 0])[:, 0], expected, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
