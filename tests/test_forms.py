@@ -22,6 +22,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, gpebo, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -820,6 +821,22 @@ def test_assumption_1_fails_at_the_time_that_is_named(size):
     told = r"Assumption 1 .* fails at t = 2: .* singular value 0\.0e\+00 .*form=strangeness_free"
     with pytest.raises(ModelError, match=told):
         observe(system, Measurements(u, y), form="given")
+
+
+def test_what_is_left_where_assumption_1_fails_is_left_at_all_times():
+    """Of v and w one is told, but not at t = 2.1, which is met when elements are cut."""
+    system = plant_from_mapping({
+        "name": "less", "states": ["a", "v", "w"], "outputs": ["y"], "C": [[1, 0, 0]],
+        "E": np.diag([1, 0, 0]).tolist(), "initial_state": [0, 0, 0],
+        "A": [[-1, 0, 0], [0, "1 - exp(-((t - 2.1)/0.05)**2)", 0], [0, 0, 0]],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    signals = Measurements(*(Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1)))
+    found = reduced_system(system, signals, SOLVER, form="given", in_part=True)
+    assert found.lost.tolist() == [False, False, True]
+    t = np.array([1.0, 2.1, 3.0])
+    with pytest.raises(ModelError, match=r"the rank of \[ΠA; C\] .* changes at t = 2\.1; use"):
+        found.matrices(t, t)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7])
