@@ -455,7 +455,7 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     """What its rounding leaves is not resolved with all elements; that costs minutes.
 
     Unasked a long run is not observed twice, nor one that as given determines everything, nor one
-    of index 1, whose constraints are all there: of c nothing is seen.
+    of index 1, whose constraints are all there: of c nothing is seen. No unit decides.
     """
     monkeypatch.setattr(gpebo, "_LONG", long)
     given, asked = gpebo.reduced_system, []
@@ -472,9 +472,9 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     }
     hidden = {
         "name": "hidden", "states": list("abce"), "inputs": {"u": "sin(t)"}, "outputs": ["y"],
-        "E": np.diag([1, 0, 1, 0]).tolist(), "B": [[0], [1e-9], [0], [1]], "C": [[0, 1, 0, 0]],
-        "A": [[-1, 1, 0, 0], [-1e-9, 1e-9 if of_all == "index 1" else 0, 0, 0], [0, 0, -1, 0],
-              [0, 0, 0, -1]],
+        "E": np.diag([1e-6, 0, 1e-6, 0]).tolist(), "B": [[0], [1e-9], [0], [1]],
+        "A": [[-1e-6, 1e-6, 0, 0], [-1e-9, 1e-9 if of_all == "index 1" else 0, 0, 0],
+              [0, 0, -1e-6, 0], [0, 0, 0, -1]], "C": [[0, 1, 0, 0]],
         "initial_state": [0, 0, 1, 0],
     }
     plants = {"growing": growing, "index 1": hidden, "index 2": hidden}
