@@ -559,6 +559,21 @@ def test_rounding_of_hidden_constraints_is_bounded_whatever_its_signs(plant):
     assert (o.rounding <= 100.0 * system.n * hidden.rounding.max()).all()
 
 
+@pytest.mark.parametrize("plant", [CAPACITORS, LC_LOOP, CRANE], ids=lambda p: p["name"])
+def test_rounding_of_hidden_constraints_is_as_large_in_any_units(plant):
+    start, t = dict(zip(plant["states"], plant["initial_state"], strict=True)), np.linspace(0, 5, 7)
+    by, found = drawn(np.random.default_rng(4), plant_from_mapping(plant), decades=True), []
+    for units in (Units(*map(np.ones_like, by[:-1]), 1.0), by):
+        system = plant_from_mapping(in_units({**plant, "initial_state": start}, units))
+        T = float(units.time)
+        inputs = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
+        given = EquationForm.given(system, inputs, T * t)
+        form = strangeness_free(given, T * t, T * t, None, max_mu=6, rank_tol=1e-10)
+        found.append(form.equations(T * t, T * t, None).hidden.rounding * form.units.states)
+    assert (found[1] < 1e3 * found[0].max()).all()
+    assert found[1].max() > 1e-3 * found[0].max()
+
+
 def test_derivatives_of_a_signal_are_those_of_its_polynomials():
     mesh = Mesh(np.linspace(0.0, 2.0, 9), radau_rule(10))
     signal = Trajectory(mesh, np.stack([np.sin(3 * mesh.points), mesh.points**2], axis=2))
