@@ -350,12 +350,14 @@ def test_resets_come_at_the_last_edge_before_the_extension_exceeds_a_hundred(pla
 
 
 def test_growth_is_that_of_the_longest_segment():
-    """Of e^t over one, two and one seconds."""
+    """Of e^t over one, two and one seconds; the rate is that of the norms of all three."""
     plant = plant_from_mapping(one_state(
         states=["a", "b"], E=[[1, 0], [0, 1]], A=[[1, 0], [1, 0]], C=[[0, 1]], initial_state=[1, 0]
     ))
     found = along(plant, 4.0, remedy="reset", reset_times=[1.0, 3.0])[1]
     assert found.growth == pytest.approx(np.exp(2.0), rel=1e-8)
+    norms = [np.linalg.norm(expm(np.array([[1, 0], [1, 0]]) * t), 2) for t in (1.0, 2.0, 1.0)]
+    assert found.growth_rate == pytest.approx(np.log(norms).sum() / 4.0, rel=1e-8)
 
 
 def test_the_gram_matrix_goes_on_through_a_reset():
