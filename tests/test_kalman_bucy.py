@@ -206,17 +206,19 @@ def test_what_regularises_an_exact_measurement_is_reported():
     ([4.0, 0.01], [4.0, 0.01]), ([0.01, 0.0], [0.01] * 2), ([0.0, 0.01], [0.01] * 2),
     ([0.0, 0.0], [1.0, 1.0]),
 ])
-@pytest.mark.parametrize("unit", [1.0, 1e6])
-def test_what_is_known_at_the_start_regularises_as_what_is_least_known_does(P0, counted, unit):
-    """y = 1.5 a + b of states that stand still, without noise: P in closed form."""
+@pytest.mark.parametrize(("unit", "noise"), [(1.0, 0.0), (1e6, 0.0), (1.0, 0.3)])
+def test_what_is_known_at_the_start_regularises_as_what_is_least_known_does(
+    P0, counted, unit, noise
+):
+    """y = 1.5 a + b of states that stand still: P in closed form, with noise or without."""
     result = api_run(
         {"name": "sum", "states": ["a", "b"], "outputs": ["y"], "E": np.eye(2).tolist(),
          "A": np.zeros((2, 2)).tolist(), "C": [[1.5, 1.0 / unit]], "initial_state": [1, 2 * unit]},
         observer={"name": "kalman_bucy", "P0": (np.array([1.0, unit**2]) * P0).tolist()},
-        noise={"name": "gaussian", "outputs": 0.0, "sample_time": 0.1}, time={"horizon": 5.0},
+        noise={"name": "gaussian", "outputs": noise, "sample_time": 0.1}, time={"horizon": 5.0},
     )
     c, P = np.array([1.5, 1.0]), np.diag(P0)
-    V = 1e-3**2 * 0.1 * c**2 @ counted
+    V = 0.1 * (noise**2 or 1e-3**2 * c**2 @ counted)
     expected = P - 5.0 * np.outer(P @ c, P @ c) / (V + 5.0 * c @ P @ c)
     found = result.details.estimation.parameters_std[0, -1] / [1.0, unit]
     np.testing.assert_allclose(found, np.sqrt(np.diag(expected)), rtol=1e-6)
