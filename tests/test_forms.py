@@ -302,7 +302,8 @@ GUIDED = {
 
 @pytest.mark.parametrize("form", ["given", "strangeness_free"])
 @pytest.mark.parametrize("plant", [
-    *map(measured, [*CONSTRAINED, GUIDED]), FOLLOWING, ROTATING, shipped("circuit"), shipped("descriptor"),
+    *map(measured, [*CONSTRAINED, GUIDED]), FOLLOWING, ROTATING,
+    shipped("circuit"), shipped("descriptor"),
 ], ids=lambda p: p["name"] if isinstance(p, dict) else p.name)
 def test_both_forms_find_the_truth_where_both_exist(plant, form):
     found, error, of_states = observed(plant, 5.0, form=form)
