@@ -310,6 +310,7 @@ def slit(width):
 def test_a_narrow_pulse_along_an_output_is_seen(width):
     found = slit(width)
     assert found["q"][-1] == pytest.approx(np.exp(-1e4 * width * np.sqrt(np.pi)), rel=1e-6)
+    assert "nothing bounds" not in found.verdict
 
 
 @pytest.mark.parametrize("least", [

@@ -12,7 +12,7 @@ from units import Units, in_units
 from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.observers.canonical import unknown_input_matrices
+from gpebo_cli.observers.canonical import canonical_blocks, unknown_input_matrices
 from gpebo_cli.settings import SolverSettings
 
 SOLVER = SolverSettings()
@@ -296,5 +296,11 @@ def test_what_does_not_fit_is_named(changes, settings, error, message):
 
 
 def test_a_plant_that_is_not_canonical_is_refused_by_entry():
-    with pytest.raises(ModelError, match=r"not in canonical form: E\[0\]\[0\]|A\["):
+    with pytest.raises(ModelError, match=r"canonical form: E\[0\]\[0\] is 4 at t = 0 .* n_a = 0"):
         run(shipped("circuit"))
+    rows = [[0, 1, 0, 0, 0], [-2, -0.5, 0, 0, 0], [0, 0, 1, 0, "0.7*step(t - 3)"],
+            [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]]
+    t = np.array([0.0, 2.0, 3.0, 4.0])
+    said = r"A\[2\]\[4\] is 0\.7 at t = 3 instead of 0 \(E .* diag\(A_a, I\), here n_a = 2\)"
+    with pytest.raises(ModelError, match=said):
+        canonical_blocks(shipped("canonical", A=rows), t, t)

@@ -188,6 +188,23 @@ def test_scalings_undo_units(seed, n, of_E):
         np.testing.assert_allclose(other, one, rtol=3.1, atol=0.0)
 
 
+@settings(deadline=None, max_examples=8)
+@given(SEEDS, st.integers(2, 6), st.sampled_from([1.0, 1e3]))
+def test_scales_are_those_of_weighted_least_squares(seed, n, mass):
+    """Entries of E/τ and A have the size that the best factors give them, up to their rounding."""
+    sizes = 2.0 ** np.random.default_rng(seed).uniform(-20.0, 20.0, (2, n, n))
+    (E, A), none, empty = sizes[:, None, None], np.zeros((1, 1, n, 0)), np.zeros((1, 1, 0))
+    s = balance(Coefficients(
+        E, A, none, none, none, empty, empty, np.zeros((1, 1, n)), none, none
+    ), mass)
+    kind, i, j = np.indices(sizes.shape).reshape(3, -1)
+    terms = np.hstack([np.eye(n)[i], np.eye(n)[j], kind[:, None] - 1.0])
+    weights, logs = np.sqrt(np.where(kind == 0, mass, 1.0)), np.log2(sizes.ravel())
+    best = terms @ np.linalg.lstsq(weights[:, None] * terms, -weights * logs)[0]
+    found = terms @ np.log2([*s.rows, *s.columns, s.time])
+    assert np.abs(found - best).max() <= 1.5 + 1e-9
+
+
 @settings(deadline=None, max_examples=30)
 @given(SEEDS, st.integers(2, 4))
 def test_no_order_of_outputs_decides_in_which_units_they_count(seed, r):

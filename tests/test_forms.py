@@ -22,6 +22,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, gpebo, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -312,9 +313,20 @@ FOLLOWING = {  # index 1: no output is differentiated
 }
 
 
+# A mass on a guide that an unknown moves: constraints say p and v at the start, beside it.
+GUIDED = {
+    "name": "guided", "states": ["p", "v", "force", "z"], "inputs": {"u": "0.2 + sin(2*t)"},
+    "unknowns": {"k": 0.7}, "outputs": ["y"], "E": np.diag([1, 1, 0, 1]).tolist(),
+    "A": [[0, 1, 0, 0], [-1, -0.3, 1, 0], [1, 0, 0, 0], [0, 1, 0, -0.5]],
+    "B": [[0], [0], [-0.4], [0]], "F": [[0], [0], ["-cos(t)"], [0]], "C": [[0, 0, 1, 0.5]],
+    "initial_state": [0, 0, 0, 1],
+}
+
+
 @pytest.mark.parametrize("form", ["given", "strangeness_free"])
 @pytest.mark.parametrize("plant", [
-    *map(measured, CONSTRAINED), FOLLOWING, ROTATING, shipped("circuit"), shipped("descriptor"),
+    *map(measured, [*CONSTRAINED, GUIDED]), FOLLOWING, ROTATING,
+    shipped("circuit"), shipped("descriptor"),
 ], ids=lambda p: p["name"] if isinstance(p, dict) else p.name)
 def test_both_forms_find_the_truth_where_both_exist(plant, form):
     found, error, of_states = observed(plant, 5.0, form=form)
@@ -467,7 +479,7 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     """What its rounding leaves is not resolved with all elements; that costs minutes.
 
     Unasked a long run is not observed twice, nor one that as given determines everything, nor one
-    of index 1, whose constraints are all there: of c nothing is seen.
+    of index 1, whose constraints are all there: of c nothing is seen. No unit decides.
     """
     monkeypatch.setattr(gpebo, "_LONG", long)
     given, asked = gpebo.reduced_system, []
@@ -484,9 +496,9 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     }
     hidden = {
         "name": "hidden", "states": list("abce"), "inputs": {"u": "sin(t)"}, "outputs": ["y"],
-        "E": np.diag([1, 0, 1, 0]).tolist(), "B": [[0], [1e-9], [0], [1]], "C": [[0, 1, 0, 0]],
-        "A": [[-1, 1, 0, 0], [-1e-9, 1e-9 if of_all == "index 1" else 0, 0, 0], [0, 0, -1, 0],
-              [0, 0, 0, -1]],
+        "E": np.diag([1e-6, 0, 1e-6, 0]).tolist(), "B": [[0], [1e-9], [0], [1]],
+        "A": [[-1e-6, 1e-6, 0, 0], [-1e-9, 1e-9 if of_all == "index 1" else 0, 0, 0],
+              [0, 0, -1e-6, 0], [0, 0, 0, -1]], "C": [[0, 1, 0, 0]],
         "initial_state": [0, 0, 1, 0],
     }
     plants = {"growing": growing, "index 1": hidden, "index 2": hidden}
@@ -569,6 +581,21 @@ def test_rounding_of_hidden_constraints_is_bounded_whatever_its_signs(plant):
     wrong = np.abs(K @ (signs * hidden.rounding)).max(axis=(0, 1))
     assert (wrong <= (1.0 + 1e-9) * o.rounding + 1e-300).all()
     assert (o.rounding <= 100.0 * system.n * hidden.rounding.max()).all()
+
+
+@pytest.mark.parametrize("plant", [CAPACITORS, LC_LOOP, CRANE], ids=lambda p: p["name"])
+def test_rounding_of_hidden_constraints_is_as_large_in_any_units(plant):
+    start, t = dict(zip(plant["states"], plant["initial_state"], strict=True)), np.linspace(0, 5, 7)
+    by, found = drawn(np.random.default_rng(4), plant_from_mapping(plant), decades=True), []
+    for units in (Units(*map(np.ones_like, by[:-1]), 1.0), by):
+        system = plant_from_mapping(in_units({**plant, "initial_state": start}, units))
+        T = float(units.time)
+        inputs = InputDerivatives.of_plant(system, np.ones(system.m, dtype=bool))
+        given = EquationForm.given(system, inputs, T * t)
+        form = strangeness_free(given, T * t, T * t, None, max_mu=6, rank_tol=1e-10)
+        found.append(form.equations(T * t, T * t, None).hidden.rounding * form.units.states)
+    assert (found[1] < 1e3 * found[0].max()).all()
+    assert found[1].max() > 1e-3 * found[0].max()
 
 
 def test_derivatives_of_a_signal_are_those_of_its_polynomials():
@@ -819,6 +846,36 @@ def test_a_failure_of_assumption_1_keeps_nothing_where_no_state_is_told_at_all_t
     u, y = (Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1))
     with pytest.raises(ModelError, match=r"Assumption 1 .* singular value"):
         observe(system, Measurements(u, y), form="given")
+
+
+@pytest.mark.parametrize("size", ["1", "exp(-20*t)"])
+def test_assumption_1_fails_at_the_time_that_is_named(size):
+    """0 = a + size (t − 2) v: v is told at any other time, however small its factor."""
+    system = plant_from_mapping({
+        "name": "once", "states": ["a", "v"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [1, f"{size}*(t - 2)"]], "C": [[1, 0]], "initial_state": [0, 0],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    u, y = (Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1))
+    told = r"Assumption 1 .* fails at t = 2: .* singular value 0\.0e\+00 .*form=strangeness_free"
+    with pytest.raises(ModelError, match=told):
+        observe(system, Measurements(u, y), form="given")
+
+
+def test_what_is_left_where_assumption_1_fails_is_left_at_all_times():
+    """Of v and w one is told, but not at t = 2.1, which is met when elements are cut."""
+    system = plant_from_mapping({
+        "name": "less", "states": ["a", "v", "w"], "outputs": ["y"], "C": [[1, 0, 0]],
+        "E": np.diag([1, 0, 0]).tolist(), "initial_state": [0, 0, 0],
+        "A": [[-1, 0, 0], [0, "1 - exp(-((t - 2.1)/0.05)**2)", 0], [0, 0, 0]],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    signals = Measurements(*(Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1)))
+    found = reduced_system(system, signals, SOLVER, form="given", in_part=True)
+    assert found.lost.tolist() == [False, False, True]
+    t = np.array([1.0, 2.1, 3.0])
+    with pytest.raises(ModelError, match=r"the rank of \[ΠA; C\] .* changes at t = 2\.1; use"):
+        found.matrices(t, t)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.7])

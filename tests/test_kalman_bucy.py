@@ -202,6 +202,28 @@ def test_what_regularises_an_exact_measurement_is_reported():
     assert "regularised" not in noisy.verdict
 
 
+@pytest.mark.parametrize(("P0", "counted"), [
+    ([4.0, 0.01], [4.0, 0.01]), ([0.01, 0.0], [0.01] * 2), ([0.0, 0.01], [0.01] * 2),
+    ([0.0, 0.0], [1.0, 1.0]),
+])
+@pytest.mark.parametrize(("unit", "noise"), [(1.0, 0.0), (1e6, 0.0), (1.0, 0.3)])
+def test_what_is_known_at_the_start_regularises_as_what_is_least_known_does(
+    P0, counted, unit, noise
+):
+    """y = 1.5 a + b of states that stand still: P in closed form, with noise or without."""
+    result = api_run(
+        {"name": "sum", "states": ["a", "b"], "outputs": ["y"], "E": np.eye(2).tolist(),
+         "A": np.zeros((2, 2)).tolist(), "C": [[1.5, 1.0 / unit]], "initial_state": [1, 2 * unit]},
+        observer={"name": "kalman_bucy", "P0": (np.array([1.0, unit**2]) * P0).tolist()},
+        noise={"name": "gaussian", "outputs": noise, "sample_time": 0.1}, time={"horizon": 5.0},
+    )
+    c, P = np.array([1.5, 1.0]), np.diag(P0)
+    V = 0.1 * (noise**2 or 1e-3**2 * c**2 @ counted)
+    expected = P - 5.0 * np.outer(P @ c, P @ c) / (V + 5.0 * c @ P @ c)
+    found = result.details.estimation.parameters_std[0, -1] / [1.0, unit]
+    np.testing.assert_allclose(found, np.sqrt(np.diag(expected)), rtol=1e-6)
+
+
 def test_quantisation_counts_as_noise():
     noise = NoiseSettings(quantisation=0.12, sample_time=0.1)
     found = assumption(run(shipped("descriptor"), noise=noise), "Measurement noise")
@@ -518,6 +540,7 @@ def test_times_far_from_zero_change_nothing(observer, start):
     np.testing.assert_allclose(found(start), found(0.0), atol=1e-6)
 
 
+
 @pytest.mark.parametrize(("sees", "form"), [(3, "given"), (-3, "strangeness_free")])
 def test_auto_is_the_form_that_gpebo_takes(sees, form):
     """Along the other sign of C the equations as given grow until they tell nothing of v."""
@@ -538,3 +561,15 @@ def test_auto_is_the_form_that_gpebo_takes(sees, form):
     assert taken == dict.fromkeys(taken, form)
     assert "not determined" not in found.verdict
     assert ("tells with more digits" in found.verdict) == (form == "strangeness_free")
+
+
+def test_rounding_of_what_constraints_say_is_not_resolved():
+    """c a + s b rests at 0, while the input makes −s a + c b as large as 1e8."""
+    c, s = np.cos(2.0), np.sin(2.0)
+    result = api_run(
+        {"name": "resting", "states": ["a", "b"], "inputs": {"u": "sin(3*t)"}, "outputs": ["y"],
+         "E": [[c, s], [0, 0]], "A": [[-c, -s], [-s, c]], "B": [[0], [1e8]],
+         "C": [[1, 0.2]], "initial_state": [0, 0]},
+        observer="kalman_bucy", solver={"max_elements": 200}, time={"horizon": 10, "samples": 51},
+    )
+    assert np.abs(result.details.estimation.parameters).max() < 1e-6

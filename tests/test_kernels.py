@@ -173,7 +173,7 @@ def _model(rng, times=19, n=3, constant=False, turned=False, steady=False):
 
 
 def _start(rng, **options):
-    return (*_model(rng, **options), 0, 1e-10)
+    return (*_model(rng, **options), 7, 1e-10)
 
 
 def _levels(rng, constraints=-1, **options):

@@ -159,7 +159,10 @@ def test_a_system_of_errors_is_interpolated_where_it_is_small_and_the_mesh_resol
 @pytest.mark.parametrize(("plant", "horizon"), [("battery", 60.0), ("motor", 0.1)])
 @pytest.mark.parametrize("estimator", ["mre", {"name": "least_squares", "f0": 1e-6}])
 def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monkeypatch):
-    """Where matrices follow signals: the same numbers, and an error estimate of the same size."""
+    """Where matrices follow signals: the same numbers, and an error estimate of the same size.
+
+    What is said of the assumptions is the same, too: of Φ both ends are kept.
+    """
     made = run(plant, observer="none", time={"horizon": horizon, "samples": 151})
     names = [*made.inputs, *made.outputs]
     rng = np.random.default_rng(0)
@@ -169,6 +172,7 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
     results = []
     for window in (10**6, 16):
         monkeypatch.setattr(mesh, "_WINDOW", window)
+        monkeypatch.setattr(gpebo, "_LONG", 2 * window)
         results.append(run(plant, data=data, estimator=estimator, time={"samples": 31}).details)
     whole, windows = (
         np.concatenate([each.estimation.parameters[0], each.estimation.states[0]], axis=1)
@@ -178,6 +182,11 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
     np.testing.assert_allclose(windows / size, whole / size, rtol=0.0, atol=1e-8)
     found = [each.regression.error_estimate for each in results]
     assert found[0] / 10 < found[1] < 10 * found[0]
+    one, other = ({
+        (a.name, key): value for a in each.assumptions for key, value in a.evidence.items()
+        if isinstance(value, float)
+    } for each in results)
+    assert other == pytest.approx(one, rel=1e-6)
 
 
 @pytest.mark.parametrize(("observer", "estimator"), [

@@ -13,7 +13,9 @@ from gpebo_cli import estimators
 from gpebo_cli import run as experiment
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.observers import observe
+from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
 from gpebo_cli.observers.reduced.regression import Assembled
 from gpebo_cli.observers.reduced.split import axes_frame, constant_split
@@ -183,6 +185,25 @@ def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_p
         np.testing.assert_allclose(value, exact, rtol=1e-12, atol=1e-300)
         assert floor == pytest.approx(least)
     assert found.lost(by) == pytest.approx(5.0 / largest[3])
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-20])
+def test_a_state_that_is_little_beside_another_one_is_resolved(size):
+    """z = size cos(40 t) x of x' = z − x, along what is smooth: of 1e-20, z counts as 1e-10.
+
+    What begins in w has no part in it.
+    """
+    system = plant_from_mapping({
+        "name": "little", "states": ["x", "z", "w"], "outputs": ["y"], "C": [[1, 0, 0]],
+        "E": np.diag([1, 0, 1]).tolist(), "initial_state": [1, size, 0],
+        "A": [[-1, 1, 0], [f"{size}*cos(40*t)", -1, 0], [0, 0, -1]],
+    })
+    mesh = initial_mesh(0.0, 2.0, [], 2, radau_rule(14))
+    y = Trajectory(mesh, np.exp(-mesh.points)[..., None])
+    t = np.linspace(0.0, 2.0, 77)
+    observation = observe(system, Measurements(Trajectory(mesh, np.zeros((2, 15, 0))), y))
+    x, z, _ = observation.state_map.gain(t)[:, :, 0].T
+    np.testing.assert_allclose(z / size, np.cos(40.0 * t) * x, atol=1e-11)
 
 
 def random_block_system(rng, n_a, n_b, r, q, varying):

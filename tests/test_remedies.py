@@ -22,6 +22,7 @@ from regressions import regression as make_regression
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm, sqrtm
 from test_observer import ROTATING
+from units import Units, in_units
 
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError, SolverError
@@ -31,6 +32,7 @@ from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
@@ -269,6 +271,39 @@ def test_a_kernel_that_rotates_leaves_the_papers_regression_its_outputs(remedy):
     assert result.regression.psi.shape[1] == rows
 
 
+def test_that_a_kernel_has_no_part_in_w_weighs_as_much_as_outputs_do():
+    """Rows c Q w = 0 of a projector Q in comparable units; c is as large as ψ is at first."""
+    plant = {**ROTATING, "initial_state": dict.fromkeys(ROTATING["states"], 0.0)}
+    given = Units(10.0 ** np.array([3, 0, -4, 1]), *map(np.ones, (1, 1, 1, 4)), 1.0)
+    _, observation = along(
+        plant_from_mapping(in_units(plant, given)), 5.0, remedy="current_coordinates"
+    )
+    t, regression = np.linspace(0.0, 5.0, 11), observation.regression
+    psi = regression.psi(t) * regression.dynamics.units
+    size = np.trace(psi[0, :4, 1:]) / 2.0
+    Q = psi[:, :4, 1:] / size
+    np.testing.assert_allclose(Q @ Q, Q, atol=1e-12)
+    assert not psi[:, :4, 0].any()
+    assert 1.0 <= size / np.abs(psi[0, 4:]).max() < 3.0
+
+
+@pytest.mark.parametrize("swings", [0, 1, 2])
+@pytest.mark.parametrize("unit", [1.0, 1e6])
+def test_the_dynamics_of_current_coordinates_are_resolved_in_any_unit_of_time(swings, unit):
+    """D_0, A_0 or b_0 along signals that rest: nothing else asks for elements."""
+    w, size = 20.0 / unit, np.array([0.02, -0.1, 0.05]) / unit
+    texts = [f"{c!r}*(2 + {k == swings:d}*sin({w!r}*t))" for k, c in enumerate(size.tolist())]
+    system = plant_from_mapping(one_state(
+        A=[[texts[1]]], unknowns={"k": 0}, F=[[texts[0]]], inputs={"u": 1}, B=[[texts[2]]],
+    ))
+    mesh = initial_mesh(0.0, 2.0 * unit, [], 1, radau_rule(5))
+    u, y = (Trajectory(mesh, np.full((1, 6, 1), value)) for value in (1.0, 0.0))
+    found = observe(system, Measurements(u, y), remedy="current_coordinates").regression.dynamics
+    t = np.linspace(0.0, 2.0 * unit, 99)[:, None]
+    expected = size * (2.0 + (np.arange(3) == swings) * np.sin(w * t))
+    np.testing.assert_allclose(found.rows(t[:, 0])[:, 0], expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["unbounded", "rotating", "mixed"])
 def test_the_regression_holds_in_every_segment(name):
     """Y = ψη and x = offset + gain η with the true parameters of each time, and T η + τ."""
@@ -315,12 +350,14 @@ def test_resets_come_at_the_last_edge_before_the_extension_exceeds_a_hundred(pla
 
 
 def test_growth_is_that_of_the_longest_segment():
-    """Of e^t over one, two and one seconds."""
+    """Of e^t over one, two and one seconds; the rate is that of the norms of all three."""
     plant = plant_from_mapping(one_state(
         states=["a", "b"], E=[[1, 0], [0, 1]], A=[[1, 0], [1, 0]], C=[[0, 1]], initial_state=[1, 0]
     ))
     found = along(plant, 4.0, remedy="reset", reset_times=[1.0, 3.0])[1]
     assert found.growth == pytest.approx(np.exp(2.0), rel=1e-8)
+    norms = [np.linalg.norm(expm(np.array([[1, 0], [1, 0]]) * t), 2) for t in (1.0, 2.0, 1.0)]
+    assert found.growth_rate == pytest.approx(np.log(norms).sum() / 4.0, rel=1e-8)
 
 
 def test_the_gram_matrix_goes_on_through_a_reset():
@@ -753,8 +790,10 @@ def test_command_refuses_in_one_line(words, message, tmp_path):
 
 
 def test_resets_are_at_edges_between_the_start_and_the_end():
-    mesh, times = _with_edges(initial_mesh(0.0, 2.0, [], 2, radau_rule(3)), np.array([0, 0.5, 2]))
-    assert (mesh.edges.tolist(), times.tolist()) == ([0.0, 0.5, 1.0, 2.0], [0.5])
+    """Near an edge that is there, they are at that one."""
+    times = np.array([0.0, 0.5, 1.0 + 1e-12, 2.0])
+    mesh, times = _with_edges(initial_mesh(0.0, 2.0, [], 2, radau_rule(3)), times)
+    assert (mesh.edges.tolist(), times.tolist()) == ([0.0, 0.5, 1.0, 2.0], [0.5, 1.0])
 
 
 def test_an_injection_that_is_not_found_asks_for_one(monkeypatch):

@@ -16,7 +16,14 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._observability import window_gramians
-from gpebo_cli.observers._riccati import Filtered, StateSpace, pair, quotient, run_filter
+from gpebo_cli.observers._riccati import (
+    Filtered,
+    StateSpace,
+    filter_windows,
+    pair,
+    quotient,
+    run_filter,
+)
 
 Of = Callable[[float], Array]
 
@@ -294,6 +301,25 @@ def test_elements_in_which_conditioning_is_lost_are_cut():
         model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-3, max_elements=1_000
     )
     assert np.abs(found.pair.values[:, :, 0, 0]).max() <= 1e3
+
+
+def test_a_window_measures_what_is_small_by_what_was_large_before():
+    """Of ζ = (e^−50t, 1e-14 sin 300 t) the second one is no signal, though the first has gone."""
+
+    def model(t, inside):
+        zero, one, b = np.zeros((1, 2, 2)), np.ones((1, 1, 1)), np.zeros((len(t), 2, 1))
+        b[:, 1, 0] = 3e-12 * np.cos(300.0 * t)
+        c = np.zeros((1, 1, 2))
+        return StateSpace(
+            np.diag([-50.0, 0.0])[None], b, c, 0.0 * b[:, :1], zero, np.zeros((1, 2, 1)), one
+        ), ()
+
+    windows = [initial_mesh(*span, [], 4, radau_rule(8)) for span in ((0.0, 1.0), (1.0, 2.0))]
+    start = np.array([[1.0], [0.0]])
+    first, second = filter_windows(
+        model, start, np.eye(2), windows, tol=1e-9, max_elements=1_000, sizes=np.ones(2)
+    )
+    assert second.mesh.size < 1.5 * first.mesh.size
 
 
 def test_a_covariance_that_becomes_indefinite_is_refused():

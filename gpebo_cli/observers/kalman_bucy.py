@@ -253,9 +253,8 @@ class KalmanBucy:
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
         of_states = known.form.units.states, known.form.units.states[:, None] / sizes
-        varies = np.where(variances > 0.0, variances, sizes**2 * (
-            (variances / sizes**2).max(initial=0.0) or 1.0
-        ))
+        largest = sizes**2 * (variances / sizes**2).max()
+        varies = np.where(variances > 0.0, variances, largest)
         model_noise = NoiseModel(
             noise.variances * noise.sample_time,
             per_name(self.process, names, "estimate", "observer.process", absent=0.0),

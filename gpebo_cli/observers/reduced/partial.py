@@ -15,7 +15,7 @@ import numpy as np
 
 from gpebo_cli.kernels.arrays import joined
 from gpebo_cli.model.descriptor import Array, BoolArray
-from gpebo_cli.numerics.linalg import exact_product, transpose, without_rounding
+from gpebo_cli.numerics.linalg import exact_product, transpose
 from gpebo_cli.observers.reduced.split import (
     TINY,
     Frame,
@@ -84,8 +84,6 @@ def _as_written(frame: Frame, left_over: Array, states: tuple[str, ...], units: 
     domain, dual, _ = initial_basis(frame.projector, frame.domain.shape[1], states, units)
     kept, of_kept, _ = initial_basis(left_over, remaining.kept.shape[1], states, units)
     own = units[:, None]
-    # A state that is given up must not look as if a small part of it was kept.
-    kept = own * without_rounding((kept / own)[None], np.ones((1, 1, 1)))[0]
     return replace(
         frame, domain=domain, dual=dual, kernel=own * frame.kernel,
         remaining=replace(
