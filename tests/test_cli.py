@@ -196,6 +196,8 @@ WRONG = [
     (["run", "estimator.gamma=logspace(1,9,1000001)"], "whole number of values up to 1000000"),
     (["run", "-m", "time.horizon=range(1,1000000000)"], "a sweep of 999999999 jobs; at most"),
     (["run", "-m", "time.horizon=range(0,1,1e-6)", "plant=window,circuit"], "of 2000000 jobs"),
+    # Values are listed before it shows that there is nothing to combine them with.
+    (["run", "-m", "time.start=range(2,1)", "time.horizon=range(1,1000000000)"], "of 999999999 jo"),
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 has no keys; give it as a whole"),
     (["run", "time.samples.foo=1"], "time.samples has no keys; give it as a whole"),
     (["run", "hydra.job.env_set={X: 1}"], "no such key; '+hydra.job.env_set.X=VALUE' adds one"),

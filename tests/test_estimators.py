@@ -850,6 +850,15 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     unit = np.array([1e-9, 1e4])
     extended[..., :2] /= unit * unit[:, None]
     assert solved(extended, extended[:, -1, :, :2], unit).requirement.holds == holds
+    # Nor do they where a fast law is followed.
+    large, small = (
+        follow(
+            always([[2.0, 0.0, 0.0], [0.0, 2.0, one]]), dynamics, np.array([one, 0.0]),
+            1e4 * gains, T,
+        ).parameters(slice(None)) / one
+        for one in (1.0, 1e-12)
+    )
+    np.testing.assert_allclose(small, large, rtol=1e-7, atol=1e-12)
 
 
 # A plain field as an axis -----------------------------------------------------------------------

@@ -432,6 +432,19 @@ def test_a_wild_estimate_is_cut_at_twice_the_range_of_the_truth(
     assert figures._estimate_limits(np.array(truth), np.array([guesses]), size) == limits
 
 
+def test_a_truth_that_is_known_at_some_times_is_drawn_and_a_wild_estimate_cut_by_it() -> None:
+    result = make_result((1e10,), samples=11)
+    states = result.signals.states.copy()
+    states[:3] = np.nan
+    estimation = estimation_of(result)
+    wild = replace(estimation, states=np.full_like(estimation.states, 1e6))
+    result = replace(result, estimation=wild, simulation=replace(result.simulation, states=states))
+    panel, *_ = describe(result, ["estimates_a"])["estimates_a"]
+    assert [curve.label for curve in panel.curves] == ["true", "drem"]
+    assert panel.limits is not None
+    assert panel.limits[1] < 100.0
+
+
 def test_a_residual_is_what_was_measured_less_what_is_fitted() -> None:
     result = make_result(samples=11)
     fit = Fit(np.ones(1), 1.0, 1.0, outputs=result.signals.outputs - 0.25)

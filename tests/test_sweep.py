@@ -104,6 +104,7 @@ def test_formulas_are_swept_whether_or_not_each_of_them_is_quoted(values):
 @pytest.mark.parametrize(("words", "keys", "count"), [
     (SWEEP, ["estimator.gamma", "estimator"], 8),
     (["run", "experiment=gain_multirun"], ["estimator", "estimator.gamma"], 10),  # of a recipe
+    (["run", "-m", "estimator=glob(l*)"], ["estimator"], 3),  # least_squares, lion, ls_drem
 ])
 def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path, words, keys, count):
     head, *jobs, last = printed(gpebo(*words, "--dry-run", cwd=tmp_path)).splitlines()
@@ -127,7 +128,7 @@ def test_words_of_a_sweep_are_refused_without_one(tmp_path, word):
         (["hydra.sweep.subdir=x"], "the folders of jobs are numbered"),
         (["estimator=drem,dremm"], "estimator=dremm: there is no such estimator"),
         (["estimator.gama=1,2"], "estimator.gama: no such key"),
-        (["hydra/launcher=joblibb"], "launcher"),
+        (["hydra/launcher=joblibb"], "there is no such hydra/launcher; known: basic"),
     ],
 )
 def test_wrong_words_are_one_line_before_anything_runs(tmp_path, words, expected):
