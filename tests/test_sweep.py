@@ -479,13 +479,15 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
         metrics = dict.fromkeys(METRICS, error)
         return Case(run, Path(run), 0, {"plant": "p", "gamma": gain}, metrics)
 
-    quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in range(3)]
+    quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in (1, 0, 2)]
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
-    assert [curve.y.tolist() for curve in first.curves] == [[1e-9] * 3]
+    assert [(curve.label, curve.y.tolist()) for curve in first.curves] == [("quiet", [1e-9] * 3)]
+    assert first.curves[0].x.tolist() == [1.0, 10.0, 100.0]
     two = [replace(c, chosen=c.chosen | {"estimator": name})
            for name in ("drem", "mre") for c in quiet]
-    legends = [panel.legend for panel in metric_panels(two, "gamma")]
-    assert legends == [True, *[False] * (len(METRICS) - 1)]
+    panels = metric_panels(two, "gamma")
+    assert [panel.legend for panel in panels] == [True, *[False] * (len(METRICS) - 1)]
+    assert [curve.label for curve in panels[0].curves] == ["drem", "mre"]
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 
