@@ -265,7 +265,8 @@ def test_a_bound_of_an_unknown_is_near_itself():
 
 def test_bounds_of_one_number_say_what_an_unknown_is():
     bounds = {"unknowns": {"leak": [-0.02, -0.02]}}
-    found = run(TANK, observer={"name": "gpebo", "bounds": bounds}, time={"horizon": HORIZON},
+    found = run(TANK, observer={"name": "gpebo", "bounds": bounds},
+                time={"horizon": HORIZON, "samples": 21},
                 estimator={"name": "least_squares", "f0": F0})
     np.testing.assert_allclose(found.estimates["leak"][0], -0.02, rtol=1e-9)
 

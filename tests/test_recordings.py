@@ -973,6 +973,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     ("°C", "degC", 1.0), ("°C", "K", None), ("cm²", "m2", 1e-4), ("mm", "m3", None),
     ("mm/s²", "m/s2", 1e-3), ("kg/m3", "g/m3", 1e3), ("cm2/K", "m2/K", 1e-4), ("m2", "k2", None),
     ("rpm", "rad/s", np.pi / 30), ("mbar", "hPa", 1.0), ("kΩ", "ohm", 1e3), ("m", "V", None),
+    ("mrad2", "rad2", 1e-6), ("km3", "m3", 1e9),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):
     assert _factor(written, unit) == (None if factor is None else pytest.approx(factor))
