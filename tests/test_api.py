@@ -38,6 +38,7 @@ from gpebo_cli import (
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
+from gpebo_cli.configs import configuration
 from gpebo_cli.experiment import limits
 from gpebo_cli.experiment.limits import paced
 from gpebo_cli.experiment.noise import noise_levels
@@ -332,6 +333,29 @@ WRONG = [
 def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
     with refused(expected):
         run(**{"plant": "circuit", **words})
+
+
+@pytest.mark.parametrize(("section", "key", "low", "high"), [
+    ("time", "samples", 2, 1_000_000), ("solver", "tol", 1e-15, 0.1), ("solver", "stages", 2, 16),
+    ("solver", "max_elements", 1, np.inf), ("solver", "max_seconds", 1, np.inf),
+    ("solver", "max_strangeness_index", 0, 20), ("solver", "rank_tol", 1e-15, 0.1),
+    ("noise", "seed", 0, np.inf), ("noise", "seeds", 1, 10_000), ("output", "dpi", 30, 1200),
+    ("output", "width", 1.5, 40.0), ("output", "max_rows", 2, np.inf),
+    ("time", "horizon", 5e-324, np.inf), ("noise", "sample_time", 5e-324, np.inf),
+    ("excitation", "rho", 5e-324, np.inf), ("excitation", "window", 5e-324, np.inf),
+])
+def test_numbers_are_accepted_up_to_their_limits(section, key, low, high):
+    def built(value):
+        words = {"name": "gaussian", key: value} if section == "noise" else {key: value}
+        made = configuration.settings({section: words}, draw=False)
+        return getattr(getattr(made, section), key)
+
+    whole = not isinstance(low, float)
+    for end, step in ((low, -1), (high, 1)):
+        if np.isfinite(end):
+            assert built(end) == end
+            with refused(f"{key}: expected "):
+                built(end + step if whole else end * 2.0**step)
 
 
 def test_a_plant_that_cannot_be_used_is_a_model_error():
