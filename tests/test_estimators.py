@@ -19,7 +19,14 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
-from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
+from gpebo_cli.estimators._scalar import (
+    kreisselmeier,
+    lion,
+    lion_rows,
+    low_pass,
+    scalar_law,
+    scalar_path,
+)
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
@@ -460,6 +467,19 @@ def test_mixed_regression_holds(make):
     delta, Y, _ = determinant_and_adjugate_action(values[..., :3], values[..., 3:])
     assert delta[0] == 0.0
     np.testing.assert_allclose(Y[..., 0], delta[:, None] * ETA, atol=1e-11 * np.abs(delta).max())
+
+
+@pytest.mark.parametrize(("sizes", "taken"), [
+    ((1e-14, 1.0), [1, 1, 1]), ((1e-26, 1e-12), [1, 1, 1]), ((1e-10, 1.0), [0, 1, 0]),
+    ((0.0, 0.0), [0, 1, 0]),
+])
+def test_lion_takes_rows_in_turn_but_those_of_rounding(sizes, taken):
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([size * three(t) for size in sizes], axis=-2),
+        lambda t: np.stack([size * three(t) @ ETA for size in sizes], axis=-1),
+        ["p1", "p2", "p3"], 10.0, 5,
+    )
+    assert lion_rows(made).tolist() == taken
 
 
 def test_ls_drem_delta_is_the_reference_one():
