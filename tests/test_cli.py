@@ -255,18 +255,21 @@ def test_a_traceback_when_it_is_asked_for(tmp_path):
     assert done.stderr.splitlines()[-1].startswith("gpebo: error: plant=circut")
 
 
-def test_an_unexpected_error_is_one_line_too(tmp_path):
+@pytest.mark.parametrize(("error", "said"), [
+    ("RuntimeError('first\\nsecond')", "internal error: RuntimeError: first second "
+     "(set HYDRA_FULL_ERROR=1 for the traceback)"),
+    ("MemoryError('17 GB')", "there is not enough memory for this: 17 GB"),
+    ("OSError(28, 'No space left', 'a.csv')", "a.csv: No space left"),
+    ("OSError('gone')", "gone"),
+])
+def test_an_unexpected_error_is_one_line_too(tmp_path, error, said):
     script = (
         "import sys; from gpebo_cli.cli import app\n"
-        "def broken(words): raise RuntimeError('first\\nsecond')\n"
+        f"def broken(words): raise {error}\n"
         "app._dispatch = broken; sys.exit(app.main())"
     )
     done = python("-c", script, cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stderr == (
-        "gpebo: error: internal error: RuntimeError: first second "
-        "(set HYDRA_FULL_ERROR=1 for the traceback)\n"
-    )
+    assert (done.returncode, done.stderr) == (1, f"gpebo: error: {said}\n")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")

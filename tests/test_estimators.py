@@ -881,6 +881,15 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     np.testing.assert_allclose(small, large, rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.parametrize(("weak", "holds"), [(1e-10, True), (1e-8, False)])
+def test_a_prior_in_a_direction_of_rounding_is_not_told_from_rounding(weak, holds):
+    """A tenth of F⁻¹ in its weakest direction is not from data, which filters know to 1e-11."""
+    extended = np.zeros((1, 3, 2, 3))
+    extended[..., :2] = [[1.0, 1.0 - weak], [1.0 - weak, 1.0]]
+    from_data = extended[:, -1, :, :2] - 0.1 * weak * np.array([[0.5, -0.5], [-0.5, 0.5]])
+    assert solved(extended, from_data, np.ones(2)).requirement.holds == holds
+
+
 # A plain field as an axis -----------------------------------------------------------------------
 
 

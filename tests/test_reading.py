@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
+from gpebo_cli.reading import read_bytes
 from gpebo_cli.schema import nearest, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
@@ -71,6 +73,13 @@ def test_absent_renamed_nested_and_untyped_fields():
         Filter, {"lambda": 1, "time": {"start": 1}, "anything": "x", "by_name": {"a": 2}}, "f"
     )
     assert built == Filter(1.0, TimeSettings(start=1.0), "x", {"a": 2})
+
+
+def test_a_file_is_read_up_to_as_many_bytes_as_it_may_have(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", 5) == b"12345"
+    with refused("has 5 bytes; at most 4 are read"):
+        read_bytes(tmp_path / "a", 4)
 
 
 def test_nearest_says_nothing_when_nothing_is_near():
