@@ -256,8 +256,8 @@ def test_a_traceback_when_it_is_asked_for(tmp_path):
 
 
 @pytest.mark.parametrize(("error", "said"), [
-    ("RuntimeError('first\\nsecond')", "internal error: RuntimeError: first second "
-     "(set HYDRA_FULL_ERROR=1 for the traceback)"),
+    ("RuntimeError('first\\nsecond')",
+     "internal error: RuntimeError: first second (set HYDRA_FULL_ERROR=1 for the traceback)"),
     ("MemoryError('17 GB')", "there is not enough memory for this: 17 GB"),
     ("OSError(28, 'No space left', 'a.csv')", "a.csv: No space left"),
     ("OSError('gone')", "gone"),
