@@ -25,7 +25,7 @@ from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import Fit, NoiseStatistics
 from gpebo_cli.results import document, html
 from gpebo_cli.results.folder import write_run
-from gpebo_cli.results.names import METRICS
+from gpebo_cli.results.names import METRICS, SETTLED, ranking, shown_metrics
 from gpebo_cli.results.report import case_table, estimate_table, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
@@ -113,6 +113,16 @@ def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
     assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])
     assert len(told) == shown
+
+
+@pytest.mark.parametrize(("cases", "shown", "first"), [
+    ([{}, {}], [*METRICS], "seconds_to_1pct_parameters"),
+    ([{SETTLED: 1.0}], [SETTLED, *list(METRICS)[2:]], "rms_error_states"),
+    ([{SETTLED: 1.0}, {}], [SETTLED, *METRICS], "rms_error_states"),
+])
+def test_under_noise_cases_are_ranked_by_their_error_over_the_whole_run(cases, shown, first):
+    assert list(shown_metrics(cases)) == shown
+    assert ranking(cases) == first
 
 
 @pytest.mark.parametrize("count", [40, 41, 45])
