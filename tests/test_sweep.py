@@ -384,6 +384,22 @@ def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monke
             assert progress._timer.is_alive() == shown
 
 
+def test_a_bar_has_the_stage_that_is_under_way_and_how_much_of_it_is_done():
+    class Part(str):
+        __slots__ = ()
+        share = 0.25
+
+    with Progress(quiet=True) as progress:
+        progress("simulate")
+        progress._show()
+        for stage, total, done in (("simulate", None, 0), ("observe", None, 0),
+                                   (Part("observe"), 1.0, 0.25), ("estimate", None, 0)):
+            if stage != "simulate":
+                progress(stage)
+            (task,) = progress._display.tasks
+            assert (task.description, task.total, task.completed) == (stage, total, done)
+
+
 def test_stages_are_told_with_their_seconds_and_how_far_they_are(capsys):
     told = []
     with Progress(loud=True) as progress:
