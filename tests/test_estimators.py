@@ -38,6 +38,7 @@ from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.plain_yaml import parse
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 T = np.linspace(0, 10, 101)
@@ -681,6 +682,43 @@ def test_least_squares_needs_the_weakest_direction_to_outweigh_the_prior(beta):
         said = estimate("least_squares", CLEAN, **gains).requirement
         assert said.holds == holds
         assert f"is {share * 99.0:.3g} times f₀; 1 % of the initial error needs 99" in said.text
+
+
+ROWS = np.column_stack([three(T), three(T) @ ETA])[:, None]
+SAMPLED = SampledRegression(
+    T, np.diff(T, prepend=T[0]), np.concatenate([ROWS[:1], ROWS]), "zoh"
+)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("gains", [{"gamma": [3e9, 5e9]}, {"gamma": [0.07, 0.5]}, {}])
+@pytest.mark.parametrize("name", [name for name in estimators.names() if name != "monotone"])
+def test_what_is_required_is_told_with_the_numbers_of_its_evidence(name, gains, sampled):
+    if name == "least_squares":
+        gains = {"f0": [1e-3, 1e-4]} if gains else {}
+    if sampled:
+        law = estimators.build({"name": name, **gains}).recursive(["p1", "p2", "p3"])
+        law.update(SAMPLED)
+        found = law.requirement
+    else:
+        found = estimate(name, CLEAN, **gains).requirement
+    evidence = dict(found.evidence)
+    whole = evidence.pop("integral_delta_squared", None)
+    rounded = [f"{value:.3g}" for value in evidence.values()]
+    assert [number for number in rounded if number not in found.text] == []
+    *_, needed = evidence.values()
+    if "left_of_the_initial_error" in evidence:
+        assert found.holds == (evidence["left_of_the_initial_error"] <= needed)
+    elif "reciprocal_condition" not in evidence:
+        reached = max(value for key, value in evidence.items() if "_times_" in key or "over" in key)
+        assert found.holds == (reached >= needed)
+    if gains.get("gamma"):
+        assert f"gain {min(gains['gamma']):.3g}" in found.text.replace("γ =", "gain")
+        if whole is not None:
+            product = evidence["gamma_times_integral"]
+            assert product == pytest.approx(min(gains["gamma"]) * whole)
+            assert found.gain == pytest.approx(needed / whole)
+            assert found.text.endswith("" if found.holds else f": γ ≥ {needed / whole:.2g}")
 
 
 @pytest.mark.parametrize(("gamma", "first", "segment"), [
