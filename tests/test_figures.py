@@ -405,6 +405,22 @@ def test_names_and_numbers_are_written_as_people_write_them() -> None:
     assert symbols.with_unit("load", "N*m") == "load (N·m)"
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-20])
+def test_a_logarithmic_axis_has_the_size_of_what_is_drawn_in_it(unit: float) -> None:
+    result = make_result(samples=11)
+    estimation, excitation = estimation_of(result), result.excitation
+    assert estimation.delta is not None
+    assert excitation is not None
+    small = replace(
+        result, estimation=replace(estimation, delta=unit * estimation.delta),
+        excitation=replace(excitation, gram_eigenvalues=unit * excitation.gram_eigenvalues),
+    )
+    for name in ("delta", "gram"):
+        (panel,) = describe(small, [name])[name]
+        drawn = [curve.y for curve in panel.curves if curve.style is not style.LIMIT]
+        assert panel.size == np.nanmax(drawn)
+
+
 def test_at_most_eight_panels_and_it_says_so() -> None:
     panel = style.Panel("x", (style.Curve(np.arange(3.0), np.arange(3.0), "", style.line(0)),))
     figure = style.compose([panel] * 30)

@@ -300,6 +300,10 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
     assert "k1    estimable from" in done.stdout
     content = json.loads(gpebo(*words, "--json", cwd=half_seen).stdout)
     assert {name for name, since in content["estimable"].items() if since is None} == UNSEEN
+    told = {line.split()[0]: line for line in done.stdout.splitlines() if "deviation " in line}
+    assert set(told) == set(content["deviations"]) == SEEN
+    for name, value in content["deviations"].items():
+        assert told[name].endswith(f" on, deviation {value:.3g} per unit of noise of the outputs")
     first = content["sensors"][0]
     assert first["state"] == "c"
     assert set(first["gained"]) == UNSEEN
