@@ -17,7 +17,7 @@ import pytest
 import yaml
 from examples import ROOT, assert_repeats, gpebo
 from omegaconf import OmegaConf
-from plants import DECAYING, one_state
+from plants import DECAYING, one_state, shipped
 from processes import assert_refused, install, printed, process, python, refused
 
 import gpebo_cli
@@ -42,9 +42,10 @@ from gpebo_cli.configs import configuration
 from gpebo_cli.experiment import limits
 from gpebo_cli.experiment.limits import paced
 from gpebo_cli.experiment.noise import noise_levels
+from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.findings import replaced
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.settings import Settings
+from gpebo_cli.settings import OutputSettings, Settings
 
 
 @pytest.fixture(scope="module")
@@ -532,6 +533,19 @@ def test_memory_is_refused_by_how_many_equations_are_differential():
         else:
             with refused(f"time.samples = 50000 would take some {refusal} of memory"):
                 limits.check(settings, plant, levels, 1)
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05}])
+@pytest.mark.parametrize(("rows", "kept"), [(303, 101), (1000, 101), (60, 20), (2, 2)])
+def test_many_cases_keep_fewer_samples_each_evenly_spread(observer, rows, kept):
+    estimation = run_experiment(Settings(
+        {"name": "ls_drem", "gamma": [1, 10, 100]}, TimeSettings(0.0, 5.0, 101),
+        observer={"name": "gpebo", **observer}, output=OutputSettings(max_rows=rows),
+    ), shipped("window")).estimation
+    t = estimation.t
+    assert (t[0], t[-1], len(t)) == (0.0, pytest.approx(5.0), kept)
+    np.testing.assert_allclose(np.diff(t), 5.0 / (kept - 1), atol=0.0501)
+    assert estimation.parameters.shape[:2] == estimation.states.shape[:2] == (3, kept)
 
 
 def test_a_loop_tells_which_share_of_it_is_done():
