@@ -108,6 +108,16 @@ def test_a_pencil_is_as_regular_as_where_it_is_most_so(copies):
     assert names["Rank condition D2"].evidence == dict.fromkeys(("rank", "needed"), 3 * copies)
 
 
+@pytest.mark.parametrize("C", [[1, 0, 0], [0, 1, 1]])
+def test_the_rank_condition_has_the_rank_of_its_matrix(C):
+    E, A = np.diag([1, 1, 0]), np.array([[-1, 0, 0], [0, 0, 1], [1, -1, 0]])
+    whole = np.block([[E, A], [np.zeros(3), np.array(C)], [np.zeros((3, 3)), E]])
+    told = found(lti(
+        states=["a", "b", "c"], E=E.tolist(), A=A.tolist(), C=[C], initial_state=[1, 1, 0],
+    ), form="strangeness_free")["Rank condition D2"]
+    assert told.evidence == {"rank": np.linalg.matrix_rank(whole), "needed": 2 + 3}
+
+
 def test_the_pencil_is_judged_in_no_units():
     """Equations times 1e-12 and 1e9, v in units of 1e-15, the output in units of 1e14, t in ns."""
     plain = found(lti())
