@@ -900,6 +900,7 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     found = follow(always(2.0 * np.eye(2, 3)), dynamics, np.zeros(2), gains, T).requirement
     assert found.holds == holds
     assert found.evidence["gamma_times_integral"] == pytest.approx(share * (1.0 + np.log(100.0)))
+    assert "of a state that may grow by e^1 needs 5.61" in found.text
     # And where η̂ = Ω⁻¹𝒴, the last Ω of every case has to be regular.
     ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
     extended = np.tile(np.eye(2, 3), (2, 3, 1, 1))

@@ -26,7 +26,7 @@ from gpebo_cli.experiment.result import Fit, NoiseStatistics
 from gpebo_cli.results import document, html
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.names import METRICS, SETTLED, ranking, shown_metrics
-from gpebo_cli.results.report import case_table, estimate_table, noise_table
+from gpebo_cli.results.report import case_table, estimate_table, loud_lines, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
 
@@ -113,6 +113,12 @@ def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     assert told == [str(k) for k in (*range(1, 7), *range(count - 5, count + 1))]
     assert rows[6:7] == ([f"… {count - 12} more in cases.csv"] if count > 12 else rows[6:7])
     assert len(told) == shown
+
+
+def test_verbose_runs_say_what_solvers_did():
+    numbers, versions = loud_lines(make_result(samples=5))
+    assert numbers == "index 2, 40 elements, error estimates states 3e-13, regression 2e-13"
+    assert f", numpy {np.__version__}, scipy " in versions
 
 
 @pytest.mark.parametrize(("cases", "shown", "first"), [
