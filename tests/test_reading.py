@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -12,7 +13,7 @@ from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
-from gpebo_cli.reading import read_bytes
+from gpebo_cli.reading import as_seen_from_here, read_bytes
 from gpebo_cli.schema import nearest, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
@@ -80,6 +81,17 @@ def test_a_file_is_read_up_to_as_many_bytes_as_it_may_have(tmp_path):
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     with refused("has 5 bytes; at most 4 are read"):
         read_bytes(tmp_path / "a", 4)
+
+
+def test_a_path_is_told_as_it_is_seen_from_here_where_that_is_shorter(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert as_seen_from_here(str(tmp_path / "a" / "b.csv")) == os.path.join("a", "b.csv")
+    monkeypatch.chdir(tmp_path.anchor)
+    assert as_seen_from_here("b.csv") == "b.csv"
+    deep = tmp_path / "/".join(["a"] * 9)
+    deep.mkdir(parents=True)
+    monkeypatch.chdir(deep)
+    assert as_seen_from_here(tmp_path.anchor) == tmp_path.anchor
 
 
 def test_nearest_says_nothing_when_nothing_is_near():
