@@ -1079,6 +1079,33 @@ def test_assumption_1_is_judged_by_the_weakest_of_several_files(tmp_path):
         assert one["at"] == pytest.approx(np.pi + shift, abs=0.03)
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_evidence_of_two_files_is_what_both_have_or_the_worse_of_either(order, tmp_path):
+    """A = sin(t) makes Φ grow by e^0.73 in one of them, and by less in the other one."""
+    plant, files = one_state(A=[["sin(t)"]]), []
+    for start, rows in ((1.0, 16), (2.5, 21)):
+        t = np.linspace(start, start + 1.0, rows)
+        files.append(write_table(tmp_path / f"{rows}.csv", {"t": t, "y": np.exp(-np.cos(t))}))
+    given = [[files[k] for k in order], *([each] for each in files)]
+    both, *each = (run(plant, data=data, time={"samples": 5}).details for data in given)
+
+    def growth(details):
+        (found,) = (a.evidence for a in details.assumptions if a.name == "Growth of Φ")
+        return found["largest_entry"], found["rate"]
+
+    grown = np.cos(1.0) - np.cos(2.0)
+    assert growth(each[0]) == pytest.approx((np.exp(grown), grown), rel=1e-6)
+    assert growth(both) == pytest.approx(np.max([growth(one) for one in each], axis=0))
+    recorded, apart = both.recording, [one.recording for one in each]
+    assert recorded.rows == 16 + 21
+    assert recorded.elements == sum(one.elements for one in apart)
+    assert (recorded.file, recorded.sha256) == tuple(
+        ", ".join(getattr(apart[k], name) for k in order) for name in ("file", "sha256")
+    )
+    worst = max(one.regression.error_estimate for one in each)
+    assert both.regression.error_estimate == pytest.approx(worst)
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])
