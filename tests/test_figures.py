@@ -585,6 +585,8 @@ def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float) -> No
     assert all(bottom <= tick <= top for tick in axes.get_yticks())
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert len(set(labels)) == len(labels)
+    if len(labels) > 1 and "." in labels[0]:
+        assert any(label[-1] != "0" for label in labels), "no more decimals than tell them apart"
 
 
 @given(st.integers(-320, 300), st.integers(1, 600))

@@ -483,17 +483,3 @@ def test_numbers_of_any_size_are_a_result_or_one_reason(key: str, value: object)
         warnings.simplefilter("error")
         with suppress(GpeboError):
             run(changed, observer="none", time={"horizon": 1, "samples": 3})
-
-
-@pytest.mark.parametrize("changes", [
-    {"inputs": {"u": "sin(t)"}, "D": [[1]]}, {"inputs": {"u": "sin(t)"}, "A": [["-u"]]},
-    {"unknowns": {"a": 2.0}, "H": [[1]]},
-])
-def test_inputs_and_unknowns_may_stand_elsewhere_than_in_B_and_F(changes):
-    plant = plant_from_mapping({
-        "name": "x", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[-1]], "C": [[1]],
-        "initial_state": [1], **changes,
-    })
-    found = plant.coefficients.taylor(np.array([0.5]), 0, signals=np.ones((1, 1, plant.m + 1)))
-    assert not found.B.any()
-    assert not found.F.any()

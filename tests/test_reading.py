@@ -14,7 +14,7 @@ from processes import refused
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.reading import as_seen_from_here, read_bytes
-from gpebo_cli.schema import nearest, read
+from gpebo_cli.schema import LARGEST, nearest, number, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
@@ -81,6 +81,13 @@ def test_a_file_is_read_up_to_as_many_bytes_as_it_may_have(tmp_path):
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     with refused("has 5 bytes; at most 4 are read"):
         read_bytes(tmp_path / "a", 4)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_numbers_of_either_sign_may_be_as_large_as_is_said(sign):
+    assert number(sign * LARGEST, "x", "finite") == sign * LARGEST
+    with refused(f"x: {2.0 * sign * LARGEST:g} is too large; numbers go up to {LARGEST:g} here"):
+        number(2.0 * sign * LARGEST, "x", "finite")
 
 
 def test_a_path_is_told_as_it_is_seen_from_here_where_that_is_shorter(tmp_path, monkeypatch):

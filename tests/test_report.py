@@ -210,6 +210,8 @@ def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
     summary = json.loads((inside / "circuit" / "summary.json").read_text())
     words = " ".join(page.text)
     assert summary["verdict"] in words
+    assert " · ".join(summary[key] for key in ("plant", "title", "reference")) in words
+    assert f"observer gpebo, estimator {summary['estimator']['name']}" in words
     for assumption in summary["assumptions"]:
         assert assumption["statement"] in words
     assert (inside / "circuit" / "config.yaml").read_text() in words
