@@ -652,6 +652,13 @@ def test_a_span_that_is_not_recorded(tmp_path, time, parts):
         load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
 
 
+def test_rows_of_a_span_are_those_inside_of_it_and_its_ends(tmp_path):
+    t = np.arange(11.0)
+    path = write_table(tmp_path / "r.csv", {"t": t, "V": np.sin(t), "y": np.cos(t)})
+    found = load(shipped("circuit"), DataSettings("csv", path), TimeSettings(2.5, 5.5, 11), 1e-12)
+    np.testing.assert_array_equal(found.rows.t, [2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
+
+
 def test_a_span_that_misses_the_samples_by_rounding_is_theirs(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text("t,V,y\n0.1,1,2\n0.2,1,3\n0.3,2,3\n")
@@ -1110,10 +1117,11 @@ def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])
     y = np.array([[1.0, 0.6, 0.4], [2.0, 1.2, 0.7], [3.0, 1.8, 1.1]])
-    files = [write_table(tmp_path / f"{k}.csv", {"t": t + k, "y": y[k]}) for k in range(3)]
+    files = [write_table(tmp_path / f"{k}.csv", {"t": t + 2 * k, "y": y[k]}) for k in range(3)]
     plant = one_state(A=[[-1]])
     found = run(plant, data={"file": files, "hold": "linear"}, time={"samples": 3})
     np.testing.assert_allclose(found.t, np.arange(7) / 2.0)
+    assert (found.details.recording.first, found.details.recording.last) == (0.0, 3.0)
     (name,) = found.outputs
     np.testing.assert_allclose(found.outputs[name], [*y[0, :2], *y[1, :2], *y[2]])
 
