@@ -548,6 +548,18 @@ def test_many_cases_keep_fewer_samples_each_evenly_spread(observer, rows, kept):
     assert estimation.parameters.shape[:2] == estimation.states.shape[:2] == (3, kept)
 
 
+def test_a_section_of_nothing_has_the_defaults():
+    assert configuration.settings({"time": None, "solver": None}, draw=False) == (
+        configuration.settings({}, draw=False)
+    )
+
+
+def test_a_result_shows_its_names_and_what_it_rests_on(circuit):
+    assert repr(circuit.inputs) == "<inputs: V>"
+    assert circuit.assumptions == circuit.details.assumptions
+    assert circuit.excitation is circuit.details.excitation
+
+
 def test_a_loop_tells_which_share_of_it_is_done():
     shares = []
     loop = paced(4, "cases", 1e9, shares.append)

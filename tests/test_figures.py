@@ -421,6 +421,14 @@ def test_a_logarithmic_axis_has_the_size_of_what_is_drawn_in_it(unit: float) -> 
         assert panel.size == np.nanmax(drawn)
 
 
+@pytest.mark.parametrize(("log", "high"), [(False, 3.0), (True, 20.0)])
+def test_an_axis_of_one_value_has_a_length(log: bool, high: float) -> None:
+    curve = style.Curve(np.array([2.0]), np.ones(1), "", style.line(0))
+    panel = style.Panel("y", (curve,), axis=style.Axis("g", "gain", log=log))
+    low, reached = style.compose([panel]).axes[0].get_xlim()
+    assert (low, reached) == pytest.approx((2.0, high), rel=0.05)
+
+
 def test_at_most_eight_panels_and_it_says_so() -> None:
     panel = style.Panel("x", (style.Curve(np.arange(3.0), np.arange(3.0), "", style.line(0)),))
     figure = style.compose([panel] * 30)

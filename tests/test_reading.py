@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -81,6 +82,11 @@ def test_a_file_is_read_up_to_as_many_bytes_as_it_may_have(tmp_path):
     assert read_bytes(tmp_path / "a", 5) == b"12345"
     with refused("has 5 bytes; at most 4 are read"):
         read_bytes(tmp_path / "a", 4)
+
+
+@pytest.mark.parametrize("value", [2, "2", 2.0, np.int64(2), np.array(2.0)])
+def test_a_number_may_come_in_many_ways(value):
+    assert number(value, "x") == 2.0
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -26,6 +26,7 @@ from gpebo_cli.experiment.result import Fit, NoiseStatistics
 from gpebo_cli.results import document, html
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.names import METRICS, SETTLED, ranking, shown_metrics
+from gpebo_cli.results.provenance import GitState, Provenance
 from gpebo_cli.results.report import case_table, estimate_table, loud_lines, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
@@ -196,6 +197,18 @@ def page_of(*words: str) -> tuple[Page, str]:
     assert report.main([*words, "--output", "page.html"]) == 0
     text = Path("page.html").read_text(encoding="utf-8")
     return Page(text), text
+
+
+@pytest.mark.parametrize(("git", "said"), [
+    (GitState("c0ffee", True), "Commit <code>c0ffee</code>, with changes that are not committed."),
+    (GitState("c0ffee", False), "Commit <code>c0ffee</code>."), (None, None),
+])
+def test_a_page_says_what_made_it(git, said):
+    foot = html.footer(Provenance({"gpebo": "0.1.0", "numpy": None, "scipy": "1.2"}, git))
+    assert "<p>gpebo 0.1.0, scipy 1.2.</p>" in foot
+    assert ("Commit" in foot) == (git is not None)
+    assert said is None or said in foot
+    assert html.table([]) == ""
 
 
 def test_rows_that_fail_are_marked_by_their_numbers_below_the_header():
