@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from units import Units, in_units
 
+import gpebo_cli
 from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
@@ -298,3 +299,19 @@ def test_what_does_not_fit_is_named(changes, settings, error, message):
 def test_a_plant_that_is_not_canonical_is_refused_by_entry():
     with pytest.raises(ModelError, match=r"not in canonical form: E\[0\]\[0\]|A\["):
         run(shipped("circuit"))
+
+
+def test_a_recording_is_explained_by_the_evidence_alone():
+    """ẑ_b moves by a law of its own, and has no output at the samples that a fit could look at."""
+    time = {"horizon": 2.0, "samples": 61}
+    made = gpebo_cli.run("canonical", observer="canonical", estimator="ls_drem", time=time)
+    data = {"t": made.t, **made.inputs, **made.outputs}
+    found = gpebo_cli.run(
+        "canonical", observer="canonical", estimator="ls_drem", time={"samples": 11},
+        data={"frame": data, "hold": "cubic"},
+    )
+    fit = found.details.fit
+    assert (fit.outputs, fit.white) == (None, None)
+    assert fit.residual[0] < 1e-4 * fit.size
+    name = made.details.estimation.names[0]
+    assert found.parameters[name] == pytest.approx(made.parameters[name], rel=1e-3)
