@@ -876,6 +876,8 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     for content, message in (
         (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
         (b"t,V,y\n", "lab.csv has no rows below its header"),
+        (b"t\n0\n1\n", "lab.csv: no character of comma, semicolon, tab and space cuts its first"),
+        (b"t,V\n0,1,2\n", "lab.csv: no character of comma, semicolon, tab and space cuts its f"),
         (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
     ):
         path.write_bytes(content)
