@@ -354,6 +354,8 @@ def test_rounding_is_no_difference(tmp_path: Path) -> None:
         return [Panel("error", (Curve(t, values, "", line(0)),), log=True, size=3.0)]
 
     assert compare(noise(), noise(), tmp_path) == []
+    falls = [[Panel("y", (Curve(t, y, "", line(0)),))] for y in (-1e6 * t, 5e-4 - 1e6 * t)]
+    assert compare(*falls, tmp_path) == []
 
 
 def test_curves_that_come_go_or_end_are_differences(tmp_path: Path) -> None:
