@@ -17,7 +17,7 @@ import pytest
 import yaml
 from examples import ROOT, assert_repeats, gpebo
 from omegaconf import OmegaConf
-from plants import DECAYING, one_state
+from plants import DECAYING, one_state, shipped
 from processes import assert_refused, install, printed, process, python, refused
 
 import gpebo_cli
@@ -38,12 +38,14 @@ from gpebo_cli import (
     system_from_functions,
 )
 from gpebo_cli.api.choice import choose, default
+from gpebo_cli.configs import configuration
 from gpebo_cli.experiment import limits
 from gpebo_cli.experiment.limits import paced
 from gpebo_cli.experiment.noise import noise_levels
+from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.findings import replaced
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.settings import Settings
+from gpebo_cli.settings import OutputSettings, Settings
 
 
 @pytest.fixture(scope="module")
@@ -334,6 +336,29 @@ def test_wrong_usage_is_a_config_error_on_one_line(words, expected):
         run(**{"plant": "circuit", **words})
 
 
+@pytest.mark.parametrize(("section", "key", "low", "high"), [
+    ("time", "samples", 2, 1_000_000), ("solver", "tol", 1e-15, 0.1), ("solver", "stages", 2, 16),
+    ("solver", "max_elements", 1, np.inf), ("solver", "max_seconds", 1, np.inf),
+    ("solver", "max_strangeness_index", 0, 20), ("solver", "rank_tol", 1e-15, 0.1),
+    ("noise", "seed", 0, np.inf), ("noise", "seeds", 1, 10_000), ("output", "dpi", 30, 1200),
+    ("output", "width", 1.5, 40.0), ("output", "max_rows", 2, np.inf),
+    ("time", "horizon", 5e-324, np.inf), ("noise", "sample_time", 5e-324, np.inf),
+    ("excitation", "rho", 5e-324, np.inf), ("excitation", "window", 5e-324, np.inf),
+])
+def test_numbers_are_accepted_up_to_their_limits(section, key, low, high):
+    def built(value):
+        words = {"name": "gaussian", key: value} if section == "noise" else {key: value}
+        made = configuration.settings({section: words}, draw=False)
+        return getattr(getattr(made, section), key)
+
+    whole = not isinstance(low, float)
+    for end, step in ((low, -1), (high, 1)):
+        if np.isfinite(end):
+            assert built(end) == end
+            with refused(f"{key}: expected "):
+                built(end + step if whole else end * 2.0**step)
+
+
 def test_a_plant_that_cannot_be_used_is_a_model_error():
     singular = {**yaml.safe_load(DECAYING), "E": [[0]], "A": [[0]]}
     with pytest.raises(ModelError) as caught:
@@ -431,8 +456,7 @@ NOISY = {"name": "gaussian", "outputs": 0.1, "sample_time": 1.0, "seeds": 3}
 @pytest.mark.parametrize(("settings", "what"), [
     ({"estimator": "gradient", "gamma": [1, 10, 100]}, "3 cases"),
     ({"observer": {"sample_time": 0.1}}, "201 samples with 1 cases"),
-    ({"observer": "kalman_bucy", "noise": NOISY},
-     "3 noise.seeds with 1 cases"),
+    ({"observer": "kalman_bucy", "noise": NOISY}, "3 noise.seeds with 1 cases"),
     ({"noise": NOISY}, "3 noise.seeds with 1 cases"),
 ])
 def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, settings, what):
@@ -441,7 +465,8 @@ def test_what_would_take_minutes_is_refused_when_that_is_known(monkeypatch, sett
     monkeypatch.setattr(f"{experiment}.limits.process_time", itertools.count(0, 100).__next__)
     for name in ("estimation._BATCH", "estimation._SAMPLES_AT_ONCE", "seeds._NUMBERS"):
         monkeypatch.setattr(f"{experiment}.{name}", 1)
-    with pytest.raises(GpeboError, match=f"^{what} would take some .*: solver.max_seconds="):
+    whole = f"{100 * int(what.split()[0])} s of computing time (the first 1 took 100.0 s), and a "
+    with refused(f"{what} would take some {whole}", ": solver.max_seconds=", by=GpeboError):
         run("window", **settings)
 
 
@@ -508,6 +533,31 @@ def test_memory_is_refused_by_how_many_equations_are_differential():
         else:
             with refused(f"time.samples = 50000 would take some {refusal} of memory"):
                 limits.check(settings, plant, levels, 1)
+
+
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05}])
+@pytest.mark.parametrize(("rows", "kept"), [(303, 101), (1000, 101), (60, 20), (2, 2)])
+def test_many_cases_keep_fewer_samples_each_evenly_spread(observer, rows, kept):
+    estimation = run_experiment(Settings(
+        {"name": "ls_drem", "gamma": [1, 10, 100]}, TimeSettings(0.0, 5.0, 101),
+        observer={"name": "gpebo", **observer}, output=OutputSettings(max_rows=rows),
+    ), shipped("window")).estimation
+    t = estimation.t
+    assert (t[0], t[-1], len(t)) == (0.0, pytest.approx(5.0), kept)
+    np.testing.assert_allclose(np.diff(t), 5.0 / (kept - 1), atol=0.0501)
+    assert estimation.parameters.shape[:2] == estimation.states.shape[:2] == (3, kept)
+
+
+def test_a_section_of_nothing_has_the_defaults():
+    assert configuration.settings({"time": None, "solver": None}, draw=False) == (
+        configuration.settings({}, draw=False)
+    )
+
+
+def test_a_result_shows_its_names_and_what_it_rests_on(circuit):
+    assert repr(circuit.inputs) == "<inputs: V>"
+    assert circuit.assumptions == circuit.details.assumptions
+    assert circuit.excitation is circuit.details.excitation
 
 
 def test_a_loop_tells_which_share_of_it_is_done():

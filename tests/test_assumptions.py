@@ -108,6 +108,16 @@ def test_a_pencil_is_as_regular_as_where_it_is_most_so(copies):
     assert names["Rank condition D2"].evidence == dict.fromkeys(("rank", "needed"), 3 * copies)
 
 
+@pytest.mark.parametrize("C", [[1, 0, 0], [0, 1, 1]])
+def test_the_rank_condition_has_the_rank_of_its_matrix(C):
+    E, A = np.diag([1, 1, 0]), np.array([[-1, 0, 0], [0, 0, 1], [1, -1, 0]])
+    whole = np.block([[E, A], [np.zeros(3), np.array(C)], [np.zeros((3, 3)), E]])
+    told = found(lti(
+        states=["a", "b", "c"], E=E.tolist(), A=A.tolist(), C=[C], initial_state=[1, 1, 0],
+    ), form="strangeness_free")["Rank condition D2"]
+    assert told.evidence == {"rank": np.linalg.matrix_rank(whole), "needed": 2 + 3}
+
+
 def test_the_pencil_is_judged_in_no_units():
     """Equations times 1e-12 and 1e9, v in units of 1e-15, the output in units of 1e14, t in ns."""
     plain = found(lti())
@@ -140,6 +150,9 @@ def test_growth_of_the_fundamental_matrix_is_reported():
     assert not names["Growth of Φ"].holds
     assert names["Regularity"].holds, "though λ = 1, which is tried, is an eigenvalue"
     (warning,) = run(one_state(A=[[1]]), observer={"form": "given"}).details.warnings
+    assert warning.startswith(
+        "Φ has grown to 4.9e+08, at 1 1/s: of its 16 digits the state estimate loses 9; a remedy"
+    )
     assert "of observer=gpebo in continuous time is needed" in warning
     assert "strangeness_free" not in warning, "no output is fed back where E is regular"
     falls = plant_from_mapping(one_state(A=[[-1]]))

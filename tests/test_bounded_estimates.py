@@ -261,6 +261,15 @@ def test_a_bound_of_an_unknown_is_near_itself():
     assert bound.near(bound, 0.1)
     assert not bound.near(ActiveBound("other", 0.0, None), 0.1)
     assert not ActiveBound("leak", 0.0, 1.0).near(ActiveBound("leak", 0.0, 2.0), 0.1)
+    assert ActiveBound("leak", 0.0, 1.0).near(ActiveBound("leak", 0.0, 1.05), 0.1)
+
+
+def test_bounds_of_one_number_say_what_an_unknown_is():
+    bounds = {"unknowns": {"leak": [-0.02, -0.02]}}
+    found = run(TANK, observer={"name": "gpebo", "bounds": bounds},
+                time={"horizon": HORIZON, "samples": 21},
+                estimator={"name": "least_squares", "f0": F0})
+    np.testing.assert_allclose(found.estimates["leak"][0], -0.02, rtol=1e-9)
 
 
 def test_bounds_hold_in_any_units():

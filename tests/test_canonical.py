@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from units import Units, in_units
 
+import gpebo_cli
 from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
@@ -304,3 +305,21 @@ def test_a_plant_that_is_not_canonical_is_refused_by_entry():
     said = r"A\[2\]\[4\] is 0\.7 at t = 3 instead of 0 \(E .* diag\(A_a, I\), here n_a = 2\)"
     with pytest.raises(ModelError, match=said):
         canonical_blocks(shipped("canonical", A=rows), t, t)
+
+
+
+
+def test_a_recording_is_explained_by_the_evidence_alone():
+    """ẑ_b moves by a law of its own, and has no output at the samples that a fit could look at."""
+    time = {"horizon": 2.0, "samples": 61}
+    made = gpebo_cli.run("canonical", observer="canonical", estimator="ls_drem", time=time)
+    data = {"t": made.t, **made.inputs, **made.outputs}
+    found = gpebo_cli.run(
+        "canonical", observer="canonical", estimator="ls_drem", time={"samples": 11},
+        data={"frame": data, "hold": "cubic"},
+    )
+    fit = found.details.fit
+    assert (fit.outputs, fit.white) == (None, None)
+    assert fit.residual[0] < 1e-4 * fit.size
+    name = made.details.estimation.names[0]
+    assert found.parameters[name] == pytest.approx(made.parameters[name], rel=1e-3)

@@ -196,6 +196,8 @@ WRONG = [
     (["run", "estimator.gamma=logspace(1,9,1000001)"], "whole number of values up to 1000000"),
     (["run", "-m", "time.horizon=range(1,1000000000)"], "a sweep of 999999999 jobs; at most"),
     (["run", "-m", "time.horizon=range(0,1,1e-6)", "plant=window,circuit"], "of 2000000 jobs"),
+    # Values are listed before it shows that there is nothing to combine them with.
+    (["run", "-m", "time.start=range(2,1)", "time.horizon=range(1,1000000000)"], "of 999999999 jo"),
     (["run", "observer.xi_a0.foo=1"], "observer.xi_a0 has no keys; give it as a whole"),
     (["run", "time.samples.foo=1"], "time.samples has no keys; give it as a whole"),
     (["run", "hydra.job.env_set={X: 1}"], "no such key; '+hydra.job.env_set.X=VALUE' adds one"),
@@ -253,18 +255,21 @@ def test_a_traceback_when_it_is_asked_for(tmp_path):
     assert done.stderr.splitlines()[-1].startswith("gpebo: error: plant=circut")
 
 
-def test_an_unexpected_error_is_one_line_too(tmp_path):
+@pytest.mark.parametrize(("error", "said"), [
+    ("RuntimeError('first\\nsecond')",
+     "internal error: RuntimeError: first second (set HYDRA_FULL_ERROR=1 for the traceback)"),
+    ("MemoryError('17 GB')", "there is not enough memory for this: 17 GB"),
+    ("OSError(28, 'No space left', 'a.csv')", "a.csv: No space left"),
+    ("OSError('gone')", "gone"),
+])
+def test_an_unexpected_error_is_one_line_too(tmp_path, error, said):
     script = (
         "import sys; from gpebo_cli.cli import app\n"
-        "def broken(words): raise RuntimeError('first\\nsecond')\n"
+        f"def broken(words): raise {error}\n"
         "app._dispatch = broken; sys.exit(app.main())"
     )
     done = python("-c", script, cwd=tmp_path)
-    assert done.returncode == 1
-    assert done.stderr == (
-        "gpebo: error: internal error: RuntimeError: first second "
-        "(set HYDRA_FULL_ERROR=1 for the traceback)\n"
-    )
+    assert (done.returncode, done.stderr) == (1, f"gpebo: error: {said}\n")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")

@@ -19,7 +19,14 @@ from gpebo_cli import estimators, observers
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
-from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, scalar_law, scalar_path
+from gpebo_cli.estimators._scalar import (
+    kreisselmeier,
+    lion,
+    lion_rows,
+    low_pass,
+    scalar_law,
+    scalar_path,
+)
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
@@ -31,6 +38,7 @@ from gpebo_cli.numerics.mesh import initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.plain_yaml import parse
 from gpebo_cli.regression.dynamics import Dynamics
+from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 T = np.linspace(0, 10, 101)
@@ -462,6 +470,19 @@ def test_mixed_regression_holds(make):
     np.testing.assert_allclose(Y[..., 0], delta[:, None] * ETA, atol=1e-11 * np.abs(delta).max())
 
 
+@pytest.mark.parametrize(("sizes", "taken"), [
+    ((1e-14, 1.0), [1, 1, 1]), ((1e-26, 1e-12), [1, 1, 1]), ((1e-10, 1.0), [0, 1, 0]),
+    ((0.0, 0.0), [0, 1, 0]),
+])
+def test_lion_takes_rows_in_turn_but_those_of_rounding(sizes, taken):
+    made = LinearRegression.from_functions(
+        lambda t: np.stack([size * three(t) for size in sizes], axis=-2),
+        lambda t: np.stack([size * three(t) @ ETA for size in sizes], axis=-1),
+        ["p1", "p2", "p3"], 10.0, 5,
+    )
+    assert lion_rows(made).tolist() == taken
+
+
 def test_ls_drem_delta_is_the_reference_one():
     _, observation = observed(shipped("circuit"))
     rows = reference("circuit")["at"]
@@ -663,6 +684,43 @@ def test_least_squares_needs_the_weakest_direction_to_outweigh_the_prior(beta):
         assert f"is {share * 99.0:.3g} times f₀; 1 % of the initial error needs 99" in said.text
 
 
+ROWS = np.column_stack([three(T), three(T) @ ETA])[:, None]
+SAMPLED = SampledRegression(
+    T, np.diff(T, prepend=T[0]), np.concatenate([ROWS[:1], ROWS]), "zoh"
+)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("gains", [{"gamma": [3e9, 5e9]}, {"gamma": [0.07, 0.5]}, {}])
+@pytest.mark.parametrize("name", [name for name in estimators.names() if name != "monotone"])
+def test_what_is_required_is_told_with_the_numbers_of_its_evidence(name, gains, sampled):
+    if name == "least_squares":
+        gains = {"f0": [1e-3, 1e-4]} if gains else {}
+    if sampled:
+        law = estimators.build({"name": name, **gains}).recursive(["p1", "p2", "p3"])
+        law.update(SAMPLED)
+        found = law.requirement
+    else:
+        found = estimate(name, CLEAN, **gains).requirement
+    evidence = dict(found.evidence)
+    whole = evidence.pop("integral_delta_squared", None)
+    rounded = [f"{value:.3g}" for value in evidence.values()]
+    assert [number for number in rounded if number not in found.text] == []
+    *_, needed = evidence.values()
+    if "left_of_the_initial_error" in evidence:
+        assert found.holds == (evidence["left_of_the_initial_error"] <= needed)
+    elif "reciprocal_condition" not in evidence:
+        reached = max(value for key, value in evidence.items() if "_times_" in key or "over" in key)
+        assert found.holds == (reached >= needed)
+    if gains.get("gamma"):
+        assert f"gain {min(gains['gamma']):.3g}" in found.text.replace("γ =", "gain")
+        if whole is not None:
+            product = evidence["gamma_times_integral"]
+            assert product == pytest.approx(min(gains["gamma"]) * whole)
+            assert found.gain == pytest.approx(needed / whole)
+            assert found.text.endswith("" if found.holds else f": γ ≥ {needed / whole:.2g}")
+
+
 @pytest.mark.parametrize(("gamma", "first", "segment"), [
     (10.0, 6.0, 1), (3.0, 1.0, 2), (0.1, 6.0, 3),
 ])
@@ -737,9 +795,9 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "drem", "gamma": -1}, "positive number"),
         ({"name": "drem", "gamma": []}, "empty list"),
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
-        ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, r"\(0, 301, 5\) needs .* ±300"),
         ({"name": "drem", "gamma": "logspace(0, -301, 5)"}, "±300"),
-        ({"name": "drem", "gamma": "logspace(0, 1, 2.5)"}, "whole number of values"),
+        ({"name": "drem", "gamma": "logspace(0, 1, 2.5)"}, r"\(0, 1, 2\.5\) needs .* whole num"),
         ({"name": "drem", "gamma": "import os"}, "not a positive number"),
         ({"name": "drem", "gamma": float("nan")}, "positive number"),
         ({"name": "drem", "gama": 1}, "gama"),
@@ -750,7 +808,8 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "least_squares", "bound": 1, "f0": 0.1}, r"below 1/f0 = 10"),
         *[({"name": "least_squares", "beta": [1e60] * k}, r"1e\+60 is too large") for k in (1, 9)],
         ({"name": "fct", "mu": 1.5}, "between 0 and 1"),
-        ({"name": "power", "alpha": 1.5}, "0 < alpha < 1 < beta"),
+        ({"name": "power", "alpha": 1.5, "gamma2": 2},
+         "0 < alpha < 1 < beta .* got alpha=1.5, beta=1.5, gamma2=2"),
         ({"name": "instrumental", "delay": 0}, r"estimator\.delay: expected a positive"),
         ({"name": "annihilator", "perturbed": ["p9"]}, r"estimator\.perturbed: .*'p9'"),
         ({"name": "ls_drem", "gamma": "logspace(0,9,10000)", "alpha": "logspace(0,9,10000)"},
@@ -841,6 +900,7 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     found = follow(always(2.0 * np.eye(2, 3)), dynamics, np.zeros(2), gains, T).requirement
     assert found.holds == holds
     assert found.evidence["gamma_times_integral"] == pytest.approx(share * (1.0 + np.log(100.0)))
+    assert "of a state that may grow by e^1 needs 5.61" in found.text
     # And where η̂ = Ω⁻¹𝒴, the last Ω of every case has to be regular.
     ends = [np.diag([1.0, 4.0]), np.diag([1e-11 if holds else 1e-13, 1.0])]
     extended = np.tile(np.eye(2, 3), (2, 3, 1, 1))
@@ -850,6 +910,24 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     unit = np.array([1e-9, 1e4])
     extended[..., :2] /= unit * unit[:, None]
     assert solved(extended, extended[:, -1, :, :2], unit).requirement.holds == holds
+    # Nor do they where a fast law is followed.
+    large, small = (
+        follow(
+            always([[2.0, 0.0, 0.0], [0.0, 2.0, one]]), dynamics, np.array([one, 0.0]),
+            1e4 * gains, T,
+        ).parameters(slice(None)) / one
+        for one in (1.0, 1e-12)
+    )
+    np.testing.assert_allclose(small, large, rtol=1e-7, atol=1e-12)
+
+
+@pytest.mark.parametrize(("weak", "holds"), [(1e-10, True), (1e-8, False)])
+def test_a_prior_in_a_direction_of_rounding_is_not_told_from_rounding(weak, holds):
+    """A tenth of F⁻¹ in its weakest direction is not from data, which filters know to 1e-11."""
+    extended = np.zeros((1, 3, 2, 3))
+    extended[..., :2] = [[1.0, 1.0 - weak], [1.0 - weak, 1.0]]
+    from_data = extended[:, -1, :, :2] - 0.1 * weak * np.array([[0.5, -0.5], [-0.5, 0.5]])
+    assert solved(extended, from_data, np.ones(2)).requirement.holds == holds
 
 
 # A plain field as an axis -----------------------------------------------------------------------

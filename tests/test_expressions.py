@@ -655,3 +655,15 @@ def test_nothing_warns(function: Callable[..., Array]) -> None:
     with np.errstate(all="warn"):
         arguments = (np.linspace(0.1, 3, 9), 2) if function is taylor else (0.0, 3.0)
         assert np.isfinite(function(expressions, *arguments)).all()
+
+
+def test_a_part_of_a_tape_keeps_what_switches_in_it():
+    texts = ("max(sin(t), cos(t))", "abs(sin(t) - 0.5)", "sign(cos(t)) + min(t, 1)", "exp(t)")
+    nodes = [parse(text, {}, "x") for text in texts]
+    whole = record(nodes)
+    for place, node in zip(whole.outputs, nodes, strict=True):
+        part, alone = whole.of([place]), record([node])
+        assert len(part.switches) == len(alone.switches)
+        assert sorted(i.operation for i in part.instructions) == sorted(
+            i.operation for i in alone.instructions
+        )

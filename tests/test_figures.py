@@ -405,6 +405,30 @@ def test_names_and_numbers_are_written_as_people_write_them() -> None:
     assert symbols.with_unit("load", "N*m") == "load (N·m)"
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-20])
+def test_a_logarithmic_axis_has_the_size_of_what_is_drawn_in_it(unit: float) -> None:
+    result = make_result(samples=11)
+    estimation, excitation = estimation_of(result), result.excitation
+    assert estimation.delta is not None
+    assert excitation is not None
+    small = replace(
+        result, estimation=replace(estimation, delta=unit * estimation.delta),
+        excitation=replace(excitation, gram_eigenvalues=unit * excitation.gram_eigenvalues),
+    )
+    for name in ("delta", "gram"):
+        (panel,) = describe(small, [name])[name]
+        drawn = [curve.y for curve in panel.curves if curve.style is not style.LIMIT]
+        assert panel.size == np.nanmax(drawn)
+
+
+@pytest.mark.parametrize(("log", "high"), [(False, 3.0), (True, 20.0)])
+def test_an_axis_of_one_value_has_a_length(log: bool, high: float) -> None:
+    curve = style.Curve(np.array([2.0]), np.ones(1), "", style.line(0))
+    panel = style.Panel("y", (curve,), axis=style.Axis("g", "gain", log=log))
+    low, reached = style.compose([panel]).axes[0].get_xlim()
+    assert (low, reached) == pytest.approx((2.0, high), rel=0.05)
+
+
 def test_at_most_eight_panels_and_it_says_so() -> None:
     panel = style.Panel("x", (style.Curve(np.arange(3.0), np.arange(3.0), "", style.line(0)),))
     figure = style.compose([panel] * 30)
@@ -453,6 +477,19 @@ def test_a_wild_estimate_is_cut_at_twice_the_range_of_the_truth(
     truth: list[float], guesses: list[float], size: float, limits: tuple[float, float] | None
 ) -> None:
     assert figures._estimate_limits(np.array(truth), np.array([guesses]), size) == limits
+
+
+def test_a_truth_that_is_known_at_some_times_is_drawn_and_a_wild_estimate_cut_by_it() -> None:
+    result = make_result((1e10,), samples=11)
+    states = result.signals.states.copy()
+    states[:3] = np.nan
+    estimation = estimation_of(result)
+    wild = replace(estimation, states=np.full_like(estimation.states, 1e6))
+    result = replace(result, estimation=wild, simulation=replace(result.simulation, states=states))
+    panel, *_ = describe(result, ["estimates_a"])["estimates_a"]
+    assert [curve.label for curve in panel.curves] == ["true", "drem"]
+    assert panel.limits is not None
+    assert panel.limits[1] < 100.0
 
 
 def test_a_residual_is_what_was_measured_less_what_is_fitted() -> None:
@@ -579,6 +616,8 @@ def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float) -> No
     assert all(bottom <= tick <= top for tick in axes.get_yticks())
     labels = [label.get_text() for label in axes.get_yticklabels()]
     assert len(set(labels)) == len(labels)
+    if len(labels) > 1 and "." in labels[0]:
+        assert any(label[-1] != "0" for label in labels), "no more decimals than tell them apart"
 
 
 @given(st.integers(-320, 300), st.integers(1, 600))

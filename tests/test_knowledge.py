@@ -300,6 +300,22 @@ def test_check_tells_what_can_be_known_and_which_sensor_is_next(half_seen):
     assert "k1    estimable from" in done.stdout
     content = json.loads(gpebo(*words, "--json", cwd=half_seen).stdout)
     assert {name for name, since in content["estimable"].items() if since is None} == UNSEEN
+    told = {line.split()[0]: line for line in done.stdout.splitlines() if "deviation " in line}
+    assert set(told) == set(content["deviations"]) == SEEN
+    for name, value in content["deviations"].items():
+        assert told[name].endswith(f" on, deviation {value:.3g} per unit of noise of the outputs")
+    said = " ".join(done.stdout.split())
+    for found in content["assumptions"]:
+        holds = "holds" if found["holds"] else "FAILS"
+        assert f" {holds} {found['name']} {found['statement']}" in said
+        for key, value in found["evidence"].items():
+            if value is not None:  # nothing, or a number that JSON does not have
+                assert f"{key} {f'{value:.4g}' if isinstance(value, float) else value}" in said
+    for sensor in content["sensors"]:
+        state, count = sensor["state"], len(sensor["estimable"])
+        gained = ", ".join(sensor["gained"]) or "nothing"
+        falls = f"{sensor['fall']:.3g} {sensor['fall_together']:.3g}"
+        assert f" {state} {count} {gained} {falls}" in said
     first = content["sensors"][0]
     assert first["state"] == "c"
     assert set(first["gained"]) == UNSEEN

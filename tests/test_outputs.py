@@ -17,7 +17,13 @@ from factories import STATES, make_result, with_figures, without_observer
 from processes import read_table, refused
 
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.experiment.result import EstimationResult, RunResult
+from gpebo_cli.experiment.result import (
+    ActiveBound,
+    EstimationResult,
+    Fit,
+    RunResult,
+    StateChange,
+)
 from gpebo_cli.results import files, tables
 from gpebo_cli.results.finished import span
 from gpebo_cli.results.folder import write_run
@@ -60,11 +66,13 @@ def test_tables_as_parquet_have_the_same_numbers(tmp_path: Path) -> None:
 
 
 def test_signals_round_trip_with_their_names(tmp_path: Path) -> None:
+    """But for a state of which nothing is known; one that is known at times has empty cells."""
     result = make_result(samples=5001)  # more rows than one chunk
+    result.simulation.states[:9, 0] = result.simulation.states[:, -1] = np.nan
     header, table = read_table(write(result, tmp_path) / "signals.csv")
     simulation = result.simulation
-    assert header == ["t", "V", "y", *STATES]
-    expected = [simulation.t, simulation.inputs, simulation.outputs, simulation.states]
+    assert header == ["t", "V", "y", *STATES[:-1]]
+    expected = [simulation.t, simulation.inputs, simulation.outputs, simulation.states[:, :-1]]
     np.testing.assert_array_equal(table, np.column_stack(expected))
 
 
@@ -229,6 +237,41 @@ def test_summary_has_the_evidence(tmp_path: Path) -> None:
     assert [case["gains"] for case in summary["cases"]] == [{"gamma": 1e10}, {"gamma": 1e8}]
     assert summary["git"] == {"commit": "c0ffee", "dirty": False}
     assert summary["verdict"].startswith("done")
+
+
+def test_summary_has_the_numbers_of_the_result(tmp_path: Path) -> None:
+    result = make_result((1e10, 1e8, 1e6))
+    assert result.metrics is not None
+    assert result.excitation is not None
+    jumps = (StateChange("e1", 1.0, 3.5, 4.0), StateChange("il", 2.0, -1.0, 5.0))
+    fit = Fit(np.array([0.2, np.nan, 0.1]), 3.0, 0.05, correlation=np.zeros(5), band=0.2, ratio=1.5)
+    bounds = {0: (ActiveBound("e1", 2.0, 3.0),), 2: (ActiveBound("il", -1.0, None),)}
+    result = replace(
+        result, fit=fit, estimation=replace(result.estimation, active=bounds),
+        simulation=replace(result.simulation, jumps=jumps, impulses=((4.0, "iv"),)),
+    )
+    summary = read_summary(write(result, tmp_path))
+    assert summary["jumps"] == [
+        {"time": 4.0, "state": "e1", "from": 1.0, "to": 3.5, "change": 2.5},
+        {"time": 5.0, "state": "il", "from": 2.0, "to": -1.0, "change": -3.0},
+    ]
+    assert summary["impulses"] == [{"time": 4.0, "state": "iv"}]
+    assert summary["fit"] == {
+        "rms_Y": 3.0, "rms_residual": [0.2, None, 0.1], "least_rms_residual": 0.1, "white": True,
+        "noise_ratio": 1.5,
+    }
+    assert summary["active_bounds"] == [
+        {"case": 0, "name": "e1", "value": 2.0, "time": 3.0},
+        {"case": 2, "name": "il", "value": -1.0, "time": None},
+    ]
+    for k, case in enumerate(summary["cases"]):
+        told = {name: strict(column[k]) for name, column in result.metrics.columns.items()}
+        assert case == {"case": k, "gains": {"gamma": 10.0 ** (10 - 2 * k)}, **told}
+    assert (summary["elements"], summary["timings"]) == (40, {"simulate": 0.002, "estimate": 0.001})
+    told = {"t_c": result.excitation.t_c, "lambda_min": result.excitation.lambda_min,
+            "normalised_min": result.excitation.level, "window": result.excitation.window,
+            "condition": result.excitation.condition}
+    assert {key: summary["excitation"][key] for key in told} == told
 
 
 def test_summary_has_the_last_estimates_and_truths_of_each_case(tmp_path: Path) -> None:

@@ -233,7 +233,8 @@ def test_gains_are_drawn_in_ascending_order_on_a_logarithmic_axis() -> None:
     [{"gamma": gamma} for gamma in (1e8, 1e10)],
     [{"gamma": gamma} for gamma in (0.0, 1.0, 2.0)],
     [{"gamma": 10.0**k, "alpha": float(k)} for k in (6, 8, 10)],
-], ids=["two", "zero", "two that vary"])
+    [{"gamma": 1.0}, {"gamma": 2.0}, {"alpha": 2.0}], [{"gamma": 1.0}, {"gamma": 2.0}, {}],
+], ids=["two", "zero", "two that vary", "others", "one without"])
 def test_no_curve_over_gains(cases: list[Mapping[str, float]]) -> None:
     result = make_result(gammas=(1.0,) * len(cases), samples=21)
     assert result.estimation is not None
@@ -353,6 +354,8 @@ def test_rounding_is_no_difference(tmp_path: Path) -> None:
         return [Panel("error", (Curve(t, values, "", line(0)),), log=True, size=3.0)]
 
     assert compare(noise(), noise(), tmp_path) == []
+    falls = [[Panel("y", (Curve(t, y, "", line(0)),))] for y in (-1e6 * t, 5e-4 - 1e6 * t)]
+    assert compare(*falls, tmp_path) == []
 
 
 def test_curves_that_come_go_or_end_are_differences(tmp_path: Path) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
-from gpebo_cli.schema import nearest, read
+from gpebo_cli.reading import as_seen_from_here, read_bytes
+from gpebo_cli.schema import LARGEST, nearest, number, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
@@ -71,6 +75,36 @@ def test_absent_renamed_nested_and_untyped_fields():
         Filter, {"lambda": 1, "time": {"start": 1}, "anything": "x", "by_name": {"a": 2}}, "f"
     )
     assert built == Filter(1.0, TimeSettings(start=1.0), "x", {"a": 2})
+
+
+def test_a_file_is_read_up_to_as_many_bytes_as_it_may_have(tmp_path):
+    (tmp_path / "a").write_bytes(b"12345")
+    assert read_bytes(tmp_path / "a", 5) == b"12345"
+    with refused("has 5 bytes; at most 4 are read"):
+        read_bytes(tmp_path / "a", 4)
+
+
+@pytest.mark.parametrize("value", [2, "2", 2.0, np.int64(2), np.array(2.0)])
+def test_a_number_may_come_in_many_ways(value):
+    assert number(value, "x") == 2.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_numbers_of_either_sign_may_be_as_large_as_is_said(sign):
+    assert number(sign * LARGEST, "x", "finite") == sign * LARGEST
+    with refused(f"x: {2.0 * sign * LARGEST:g} is too large; numbers go up to {LARGEST:g} here"):
+        number(2.0 * sign * LARGEST, "x", "finite")
+
+
+def test_a_path_is_told_as_it_is_seen_from_here_where_that_is_shorter(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert as_seen_from_here(str(tmp_path / "a" / "b.csv")) == os.path.join("a", "b.csv")
+    monkeypatch.chdir(tmp_path.anchor)
+    assert as_seen_from_here("b.csv") == "b.csv"
+    deep = tmp_path / "/".join(["a"] * 9)
+    deep.mkdir(parents=True)
+    monkeypatch.chdir(deep)
+    assert as_seen_from_here(tmp_path.anchor) == tmp_path.anchor
 
 
 def test_nearest_says_nothing_when_nothing_is_near():

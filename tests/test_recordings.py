@@ -652,6 +652,13 @@ def test_a_span_that_is_not_recorded(tmp_path, time, parts):
         load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
 
 
+def test_rows_of_a_span_are_those_inside_of_it_and_its_ends(tmp_path):
+    t = np.arange(11.0)
+    path = write_table(tmp_path / "r.csv", {"t": t, "V": np.sin(t), "y": np.cos(t)})
+    found = load(shipped("circuit"), DataSettings("csv", path), TimeSettings(2.5, 5.5, 11), 1e-12)
+    np.testing.assert_array_equal(found.rows.t, [2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0])
+
+
 def test_a_span_that_misses_the_samples_by_rounding_is_theirs(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text("t,V,y\n0.1,1,2\n0.2,1,3\n0.3,2,3\n")
@@ -869,6 +876,8 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     for content, message in (
         (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
         (b"t,V,y\n", "lab.csv has no rows below its header"),
+        (b"t\n0\n1\n", "lab.csv: no character of comma, semicolon, tab and space cuts its first"),
+        (b"t,V\n0,1,2\n", "lab.csv: no character of comma, semicolon, tab and space cuts its f"),
         (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
     ):
         path.write_bytes(content)
@@ -973,6 +982,7 @@ def test_a_recording_with_numbers_for_gaps_is_that_with_gaps(tmp_path):
     ("°C", "degC", 1.0), ("°C", "K", None), ("cm²", "m2", 1e-4), ("mm", "m3", None),
     ("mm/s²", "m/s2", 1e-3), ("kg/m3", "g/m3", 1e3), ("cm2/K", "m2/K", 1e-4), ("m2", "k2", None),
     ("rpm", "rad/s", np.pi / 30), ("mbar", "hPa", 1.0), ("kΩ", "ohm", 1e3), ("m", "V", None),
+    ("mrad2", "rad2", 1e-6), ("km3", "m3", 1e9),
 ])
 def test_units_are_converted_where_that_is_plain(written, unit, factor):
     assert _factor(written, unit) == (None if factor is None else pytest.approx(factor))
@@ -1078,14 +1088,42 @@ def test_assumption_1_is_judged_by_the_weakest_of_several_files(tmp_path):
         assert one["at"] == pytest.approx(np.pi + shift, abs=0.03)
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_evidence_of_two_files_is_what_both_have_or_the_worse_of_either(order, tmp_path):
+    """A = sin(t) makes Φ grow by e^0.73 in one of them, and by less in the other one."""
+    plant, files = one_state(A=[["sin(t)"]]), []
+    for start, rows in ((1.0, 16), (2.5, 21)):
+        t = np.linspace(start, start + 1.0, rows)
+        files.append(write_table(tmp_path / f"{rows}.csv", {"t": t, "y": np.exp(-np.cos(t))}))
+    given = [[files[k] for k in order], *([each] for each in files)]
+    both, *each = (run(plant, data=data, time={"samples": 5}).details for data in given)
+
+    def growth(details):
+        (found,) = (a.evidence for a in details.assumptions if a.name == "Growth of Φ")
+        return found["largest_entry"], found["rate"]
+
+    grown = np.cos(1.0) - np.cos(2.0)
+    assert growth(each[0]) == pytest.approx((np.exp(grown), grown), rel=1e-6)
+    assert growth(both) == pytest.approx(np.max([growth(one) for one in each], axis=0))
+    recorded, apart = both.recording, [one.recording for one in each]
+    assert recorded.rows == 16 + 21
+    assert recorded.elements == sum(one.elements for one in apart)
+    assert (recorded.file, recorded.sha256) == tuple(
+        ", ".join(getattr(apart[k], name) for k in order) for name in ("file", "sha256")
+    )
+    worst = max(one.regression.error_estimate for one in each)
+    assert both.regression.error_estimate == worst
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])
     y = np.array([[1.0, 0.6, 0.4], [2.0, 1.2, 0.7], [3.0, 1.8, 1.1]])
-    files = [write_table(tmp_path / f"{k}.csv", {"t": t + k, "y": y[k]}) for k in range(3)]
+    files = [write_table(tmp_path / f"{k}.csv", {"t": t + 2 * k, "y": y[k]}) for k in range(3)]
     plant = one_state(A=[[-1]])
     found = run(plant, data={"file": files, "hold": "linear"}, time={"samples": 3})
     np.testing.assert_allclose(found.t, np.arange(7) / 2.0)
+    assert (found.details.recording.first, found.details.recording.last) == (0.0, 3.0)
     (name,) = found.outputs
     np.testing.assert_allclose(found.outputs[name], [*y[0, :2], *y[1, :2], *y[2]])
 

@@ -40,6 +40,7 @@ def canonical(**changes):
     ("settings", "message"),
     [
         ({"time": {"start": 1e9, "horizon": 1e-9}}, "too short to be resolved beside time.start"),
+        ({"time": {"horizon": 1e-310}}, "1e-310 s is too short to be resolved"),
         ({"plant": plant_from_mapping(HIDDEN)}, "t = 1 puts an impulse into b; an observer cannot"),
         *(({"data": {"name": "csv", "file": file}}, "data=csv needs data.file=FILE")
           for file in (None, "", [])),

@@ -27,8 +27,9 @@ from gpebo_cli.results import document, html
 from gpebo_cli.results.comparison import figures
 from gpebo_cli.results.finished import find
 from gpebo_cli.results.folder import write_run
-from gpebo_cli.results.names import METRICS
-from gpebo_cli.results.report import case_table, estimate_table, noise_table
+from gpebo_cli.results.names import METRICS, SETTLED, ranking, shown_metrics
+from gpebo_cli.results.provenance import GitState, Provenance
+from gpebo_cli.results.report import case_table, estimate_table, loud_lines, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
 
@@ -117,6 +118,22 @@ def test_of_many_cases_the_first_and_the_last_are_printed(count, shown):
     assert len(told) == shown
 
 
+def test_verbose_runs_say_what_solvers_did():
+    numbers, versions = loud_lines(make_result(samples=5))
+    assert numbers == "index 2, 40 elements, error estimates states 3e-13, regression 2e-13"
+    assert f", numpy {np.__version__}, scipy " in versions
+
+
+@pytest.mark.parametrize(("cases", "shown", "first"), [
+    ([{}, {}], [*METRICS], "seconds_to_1pct_parameters"),
+    ([{SETTLED: 1.0}], [SETTLED, *list(METRICS)[2:]], "rms_error_states"),
+    ([{SETTLED: 1.0}, {}], [SETTLED, *METRICS], "rms_error_states"),
+])
+def test_under_noise_cases_are_ranked_by_their_error_over_the_whole_run(cases, shown, first):
+    assert list(shown_metrics(cases)) == shown
+    assert ranking(cases) == first
+
+
 @pytest.mark.parametrize("count", [40, 41, 45])
 def test_of_many_cases_a_comparison_prints_the_best(tmp_path, capsys, count):
     gains = tuple(1e8 * (k + 1) for k in range(count))
@@ -184,6 +201,18 @@ def page_of(*words: str) -> tuple[Page, str]:
     return Page(text), text
 
 
+@pytest.mark.parametrize(("git", "said"), [
+    (GitState("c0ffee", True), "Commit <code>c0ffee</code>, with changes that are not committed."),
+    (GitState("c0ffee", False), "Commit <code>c0ffee</code>."), (None, None),
+])
+def test_a_page_says_what_made_it(git, said):
+    foot = html.footer(Provenance({"gpebo": "0.1.0", "numpy": None, "scipy": "1.2"}, git))
+    assert "<p>gpebo 0.1.0, scipy 1.2.</p>" in foot
+    assert ("Commit" in foot) == (git is not None)
+    assert said is None or said in foot
+    assert html.table([]) == ""
+
+
 def test_rows_that_fail_are_marked_by_their_numbers_below_the_header():
     written = html.table([["name"], ["a"], ["b"]], failed=[1])
     assert [line for line in written.splitlines() if "class=fails" in line] == [
@@ -196,6 +225,8 @@ def test_a_run_is_on_the_page_with_all_that_it_rests_on(inside):
     summary = json.loads((inside / "circuit" / "summary.json").read_text())
     words = " ".join(page.text)
     assert summary["verdict"] in words
+    assert " · ".join(summary[key] for key in ("plant", "title", "reference")) in words
+    assert f"observer gpebo, estimator {summary['estimator']['name']}" in words
     for assumption in summary["assumptions"]:
         assert assumption["statement"] in words
     assert (inside / "circuit" / "config.yaml").read_text() in words

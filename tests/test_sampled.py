@@ -64,6 +64,22 @@ def regression(K=40, r=2, p=3, hold="zoh", steps=None):
     return SampledRegression(np.cumsum(steps), steps, rows, hold)
 
 
+@pytest.mark.parametrize("name", ["gradient", "mre"])
+def test_what_is_left_of_an_error_is_told_in_no_units(name):
+    made, size = regression(), np.array([1.0, 1e3, 1e-2])
+    other = replace(made, rows=made.rows * np.append(size, 1.0))
+
+    def left(regression, gains):
+        gamma = dict(zip("abc", gains.tolist(), strict=True))
+        law = estimators.build({"name": name, "gamma": gamma}).recursive(["a", "b", "c"])
+        law.update(regression)
+        return law.requirement.evidence["left_of_the_initial_error"]
+
+    gains = np.array([0.02, 0.01, 0.03])
+    assert 1e-6 < left(made, gains) < 0.9
+    assert left(other, gains / size**2) == pytest.approx(left(made, gains), rel=1e-6)
+
+
 # Against the observer in continuous time ------------------------------------------------------
 
 

@@ -104,6 +104,7 @@ def test_formulas_are_swept_whether_or_not_each_of_them_is_quoted(values):
 @pytest.mark.parametrize(("words", "keys", "count"), [
     (SWEEP, ["estimator.gamma", "estimator"], 8),
     (["run", "experiment=gain_multirun"], ["estimator", "estimator.gamma"], 10),  # of a recipe
+    (["run", "-m", "estimator=glob(l*)"], ["estimator"], 3),  # least_squares, lion, ls_drem
 ])
 def test_dry_run_lists_the_jobs_and_leaves_nothing(tmp_path, words, keys, count):
     head, *jobs, last = printed(gpebo(*words, "--dry-run", cwd=tmp_path)).splitlines()
@@ -127,7 +128,7 @@ def test_words_of_a_sweep_are_refused_without_one(tmp_path, word):
         (["hydra.sweep.subdir=x"], "the folders of jobs are numbered"),
         (["estimator=drem,dremm"], "estimator=dremm: there is no such estimator"),
         (["estimator.gama=1,2"], "estimator.gama: no such key"),
-        (["hydra/launcher=joblibb"], "launcher"),
+        (["hydra/launcher=joblibb"], "there is no such hydra/launcher; known: basic"),
     ],
 )
 def test_wrong_words_are_one_line_before_anything_runs(tmp_path, words, expected):
@@ -362,7 +363,7 @@ def test_of_a_long_table_and_of_many_failures_the_first_ones_are_told(
     for count, more in ((25, ["… 5 more"]), (21, ["… 1 more"]), (20, [])):
         _print_table(records[:count], tmp_path / "s", rows=True)
         head, *body = capsys.readouterr().out.splitlines()
-        assert head.split()[:2] == ["job", "a"]
+        assert head.split() == ["job", "a", "status", "case", "seconds"]  # there are no metrics
         assert [line.split()[0] for line in body[:20]] == [str(k) for k in range(20)]
         ends = ["s/results.csv", f"{count} jobs, {count - 7} done, 7 failed"]
         assert body[20:] == [*more, *ends]
@@ -381,6 +382,22 @@ def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monke
     for options, shown in (({}, True), ({"quiet": True}, False), ({"loud": True}, False)):
         with Progress(**options) as progress:
             assert progress._timer.is_alive() == shown
+
+
+def test_a_bar_has_the_stage_that_is_under_way_and_how_much_of_it_is_done():
+    class Part(str):
+        __slots__ = ()
+        share = 0.25
+
+    with Progress(quiet=True) as progress:
+        progress("simulate")
+        progress._show()
+        for stage, total, done in (("simulate", None, 0), ("observe", None, 0),
+                                   (Part("observe"), 1.0, 0.25), ("estimate", None, 0)):
+            if stage != "simulate":
+                progress(stage)
+            (task,) = progress._display.tasks
+            assert (task.description, task.total, task.completed) == (stage, total, done)
 
 
 def test_stages_are_told_with_their_seconds_and_how_far_they_are(capsys):
@@ -478,13 +495,15 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
         metrics = dict.fromkeys(METRICS, error)
         return Case(run, Path(run), 0, {"plant": "p", "gamma": gain}, metrics)
 
-    quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in range(3)]
+    quiet = [case(f"quiet/{k}", 10.0**k, 1e-9) for k in (1, 0, 2)]
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
-    assert [curve.y.tolist() for curve in first.curves] == [[1e-9] * 3]
+    assert [(curve.label, curve.y.tolist()) for curve in first.curves] == [("quiet", [1e-9] * 3)]
+    assert first.curves[0].x.tolist() == [1.0, 10.0, 100.0]
     two = [replace(c, chosen=c.chosen | {"estimator": name})
            for name in ("drem", "mre") for c in quiet]
-    legends = [panel.legend for panel in metric_panels(two, "gamma")]
-    assert legends == [True, *[False] * (len(METRICS) - 1)]
+    panels = metric_panels(two, "gamma")
+    assert [panel.legend for panel in panels] == [True, *[False] * (len(METRICS) - 1)]
+    assert [curve.label for curve in panels[0].curves] == ["drem", "mre"]
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
 
 

@@ -313,6 +313,8 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
                        "of these estimates than of the model")),
     ({"least": 0.02}, WHITE),
     ({"residual": [5e-5], "least": 1e-9}, ": the estimates explain the data"),
+    ({"residual": [5e-4], "least": 1e-9, "size": 10.0}, ": the estimates explain the data"),
+    ({"residual": [5e-6], "least": 5e-6, "size": 0.01}, WHITE),
     ({"correlation": None}, ""), ({"correlation": None, "ratio": 3.9}, f", 3.90{TIMES}"),
     ({"correlation": None, "ratio": 4.1}, f", 4.10{TIMES}, which suggests {WHY}"),
     ({"ratio": 0.05, "slow": True}, f": the residual is far below the noise, 0.05{TIMES}"),

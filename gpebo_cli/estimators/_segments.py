@@ -54,8 +54,8 @@ def tuned_for(estimator: Estimator, requirement: Callable[[Estimator], Requireme
 
 def goes_on(estimator: Estimator) -> bool:
     """Whether it takes a long regression window by window."""
-    members = estimator.members if isinstance(estimator, Several) else (estimator,)
-    return all(isinstance(member, Windowed) for member in members)
+    one = estimator.members[0] if isinstance(estimator, Several) else estimator
+    return isinstance(one, Windowed)
 
 
 def estimate(

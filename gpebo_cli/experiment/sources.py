@@ -253,6 +253,4 @@ def _changes(
 def kept_samples(cases: int, samples: int, max_rows: int) -> IntArray:
     """Indices of the samples that are kept, evenly spread, first and last among them."""
     count = min(samples, max(2, max_rows // max(cases, 1)))
-    if count == samples:
-        return np.arange(samples)
     return np.unique(np.rint(np.linspace(0, samples - 1, count)).astype(np.intp))

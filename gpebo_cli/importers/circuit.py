@@ -161,7 +161,6 @@ class _Builder:
         self.draft = PlantDraft(name, title=netlist.title or f"circuit {name}", reference=file)
         self.draft.comments.append(f"Modified nodal analysis of {file}.")
         self._taken: set[str] = set()
-        self._turned: set[int] = set()  # rows that are multiplied by −1
         self.called: dict[str, str] = {}  # parameter or input of an element, by lower-case name
         self._node: dict[str, str] = {}  # state of a node's voltage
         self._row: dict[str, int] = {}  # of a node's balance of currents
@@ -201,7 +200,6 @@ class _Builder:
                 )
         for e in self.elements.values():
             getattr(self, f"_stamp_{e.kind}")(e)
-        draft.negate(self._turned)  # an algebraic equation begins with a minus, as balances do
         self._start_of_capacitors()
         self._start_of_resistors()
         return draft
@@ -364,14 +362,11 @@ class _Builder:
         self._branch(back, column, name)
 
     def _voltage_row(self, e: Element, says: str) -> tuple[int, str]:
-        """A row that begins with v_a − v_b, or is turned to begin with a minus, and its current."""
+        """A row that begins with v_a − v_b, and its current."""
         row, column = self.draft.equation(f"{e.name}: {says}"), self._current[e.name.lower()]
-        ends = {node: sign for node, sign in zip(e.nodes, (1.0, -1.0), strict=False)
-                if node != GROUND and e.nodes[0] != e.nodes[1]}
-        for node, sign in ends.items():
-            self.draft.add("A", row, self._node[node], sign)
-        if e.kind != "L" and ends and ends[min(ends, key=self._row.__getitem__)] > 0.0:
-            self._turned.add(row)
+        for node, sign in zip(e.nodes, (1.0, -1.0), strict=False):
+            if node != GROUND and e.nodes[0] != e.nodes[1]:
+                self.draft.add("A", row, self._node[node], sign)
         self._branch(e.nodes, column)
         return row, column
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -67,18 +67,6 @@ class PlantDraft:
         for i, j, value in _nonzero(values):
             text = isinstance(value, str) and sign < 0
             self.add(matrix, first + i, columns[j], f"-({value})" if text else sign * value)
-
-    def negate(self, rows: Collection[int]) -> None:
-        """Multiply equations by −1."""
-        for matrix in "EABF":
-            for (row, _), terms in self._terms[matrix].items():
-                if row in rows:
-                    terms[:] = [
-                        -term if not isinstance(term, str)
-                        # Texts are products, with a minus or without.
-                        else term[1:] if term.startswith("-") else f"-{term}"
-                        for term in terms
-                    ]
 
     def measure(self, names: Iterable[str], where: str) -> None:
         """Make states the outputs, in place of those there are.

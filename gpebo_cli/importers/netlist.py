@@ -205,7 +205,7 @@ def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
             k += 1
             continue
         stop = k + 3  # on=1,3,5: more numbers belong to the key
-        while number(words[stop]) is not None and words[stop + 1] != "=":
+        while number(words[stop]) is not None:
             stop += 1
         options[key.lower()] = " ".join(words[k + 2 : stop])
         k = stop

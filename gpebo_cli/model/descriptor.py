@@ -192,9 +192,11 @@ class DescriptorSystem:
 
 
 def differential_order(system: DescriptorSystem, start: float) -> int:
-    """The rank of E at the ``start``, or n where E is no number there."""
-    E = system.coefficients.of_time.taylor(np.array([start]), 0).E[0, 0] if system.n else np.eye(0)
-    return int(np.linalg.matrix_rank(E)) if E.size and np.isfinite(E).all() else system.n
+    """The rank of E at the ``start``."""
+    if not system.n:
+        return 0
+    E = system.coefficients.of_time.taylor(np.array([start]), 0).E[0, 0]
+    return int(np.linalg.matrix_rank(E))
 
 
 def check_sizes(system: DescriptorSystem, t: Array) -> None:

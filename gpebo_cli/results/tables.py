@@ -172,8 +172,7 @@ def frame(result: RunResult, name: str) -> DataFrame:
 
 def write_table(path: Path, table: Table) -> None:
     """Write a table as CSV; NaN is an empty cell."""
-    first = "%d" if table.header[0] == "case" else "%.17g"
-    pieces = (text for piece in table.pieces for text in rows_text(piece, first))
+    pieces = (text for piece in table.pieces for text in rows_text(piece))
     head = csv_text([table.header]).encode()  # a name may need quotes; numbers never do
     write_file(path, chain([head], pieces))
 
@@ -191,9 +190,9 @@ def write_noise(path: Path, estimation: EstimationResult, noise: NoiseStatistics
     write_text(path, csv_text(rows))
 
 
-def rows_text(table: Array, first: str = "%.17g") -> Iterator[bytes]:
-    """A table (rows, columns) as CSV, its first column in a format of its own; NaN is empty."""
-    line = ",".join([first] + ["%.17g"] * (table.shape[1] - 1)) + "\n"
+def rows_text(table: Array) -> Iterator[bytes]:
+    """A table (rows, columns) as CSV; NaN is empty."""
+    line = ",".join(["%.17g"] * table.shape[1]) + "\n"
     for start in range(0, len(table), _CHUNK_ROWS):
         chunk = table[start : start + _CHUNK_ROWS]
         text = (line * len(chunk) % tuple(chunk.ravel().tolist())).encode()
