@@ -307,8 +307,6 @@ def test_a_plant_that_is_not_canonical_is_refused_by_entry():
         canonical_blocks(shipped("canonical", A=rows), t, t)
 
 
-
-
 def test_a_recording_is_explained_by_the_evidence_alone():
     """ẑ_b moves by a law of its own, and has no output at the samples that a fit could look at."""
     time = {"horizon": 2.0, "samples": 61}

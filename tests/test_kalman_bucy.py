@@ -540,7 +540,6 @@ def test_times_far_from_zero_change_nothing(observer, start):
     np.testing.assert_allclose(found(start), found(0.0), atol=1e-6)
 
 
-
 @pytest.mark.parametrize(("sees", "form"), [(3, "given"), (-3, "strangeness_free")])
 def test_auto_is_the_form_that_gpebo_takes(sees, form):
     """Along the other sign of C the equations as given grow until they tell nothing of v."""
