@@ -122,7 +122,7 @@ def _residual_restarts(packed: Trajectory) -> dict[float, Callable[[Array], Arra
 def _with_residual(signals: Array, state: Array) -> Array:
     """(η̂, ν) from η̂ (p, c), or more rows below it, and [M | N | b] (k, 2p + c) at one time."""
     p = (signals.shape[1] - state.shape[1]) // 2
-    eta, (_, N, b) = state[:p], np.split(signals, [p, 2 * p], axis=1)
+    eta, N, b = state[:p], signals[:, p : 2 * p], signals[:, 2 * p :]  # np.split takes far longer
     return np.concatenate([eta, b - N @ eta])
 
 
