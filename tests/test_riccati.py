@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_continuous_are
 from gpebo_cli.errors import SolverError
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
-from gpebo_cli.numerics.mesh import initial_mesh
+from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import (
@@ -366,6 +366,25 @@ def test_window_gramians_of_a_constant_system(stages):
     np.testing.assert_allclose(
         found.gramians, np.broadcast_to(expected, found.gramians.shape), rtol=1e-9
     )
+
+
+@pytest.mark.parametrize("origin", [0.0, 1e6])
+def test_window_gramians_do_not_hang_on_the_mesh(origin):
+    """A system that is seen less and less, on elements longer and shorter than windows."""
+    A, found = np.array([[0.0, 1.0], [-4.0, -0.1]]), []
+
+    def model(t: Array, inside: Array) -> tuple[Array, Array]:
+        W = np.exp(-(t - origin)) * (1.0 + np.cos(3.0 * (t - origin)))
+        return A[None], W[:, None, None] * np.diag([1.0, 0.0])
+
+    for edges in (np.linspace(0.0, 10.0, 8), np.array([0.0, 0.3, *np.geomspace(0.7, 10.0, 60)])):
+        mesh = Mesh(edges, radau_rule(8), origin)
+        found.append(window_gramians(model, 2, mesh, tol=1e-12, max_elements=2000))
+    one, other = found
+    np.testing.assert_allclose(one.starts - origin, other.starts - origin, atol=1e-8)
+    assert one.starts[[0, -1]] - origin == pytest.approx([0.0, 9.0])
+    size = np.abs(one.gramians).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(one.gramians / size, other.gramians / size, atol=1e-8)
 
 
 def test_a_chain_of_many_states_needs_few_elements():

@@ -23,13 +23,14 @@ from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 
 _WINDOWS = 10  # to a horizon
-_STARTS = 1000  # of windows, about: of more elements several are taken as one
+_STARTS = 20  # of windows within one: they do not hang on a mesh
+_SAME = 1e-9  # of a window: times that are no different
 _STAGES = 6  # at least: products that begin anew in every element look rough to fewer
 
 
 @dataclass(frozen=True, eq=False)
 class WindowGramians:
-    """M over windows that start at some edges of a mesh and last ``window`` seconds or more."""
+    """M over windows of ``window`` seconds."""
 
     starts: Array  # (W,)
     gramians: Array  # (W, n, n)
@@ -40,7 +41,7 @@ def window_gramians(
     model: Callable[[Array, Array], tuple[Array, Array]], n: int, mesh: Mesh, *, tol: float,
     max_elements: int,
 ) -> WindowGramians:
-    """M over windows of a tenth of the horizon, from every edge that leaves room for one, or some.
+    """M over windows of a tenth of the horizon, which begin at times of equal distance.
 
     ``model`` gives A and W (N, n, n) at times (N,); ``tol`` is relative to the size of Ψ and of
     what is integrated.
@@ -61,24 +62,27 @@ def window_gramians(
         coefficients, np.eye(n), monitor, "observability Gramian",
         renewal=lambda reached: np.eye(len(reached)),
     )
-    span, together = mesh.span, -(-mesh.size // _STARTS)
-    mesh = replace(mesh, rule=radau_rule(max(mesh.rule.stages, _STAGES)))
+    edges, (start, stop) = mesh.edges, mesh.edges[[0, -1]]
+    window, grid = (stop - start) / _WINDOWS, np.linspace(start, stop, _WINDOWS * _STARTS + 1)
+    near = edges[np.searchsorted(edges, grid - _SAME * window).clip(max=mesh.size)]
+    grid = np.where(np.abs(near - grid) <= _SAME * window, near, grid)
+    mesh = replace(mesh, edges=np.union1d(edges, grid), rule=radau_rule(
+        max(mesh.rule.stages, _STAGES)
+    ))
     found: list[tuple[Array, Array, Array]] = []
     for part in mesh.windows():
         solution = solve(problem, part, tol=tol, max_elements=max_elements)
         own, values = solution.trajectory.mesh, solution.trajectory.values
         weighed = Trajectory(own, products(values, solution.extras))
         local = weighed.integral(local=True).values[:, -1]
-        first = np.arange(0, own.size, together)
-        after = np.minimum(first + together, own.size)
-        found.append((own.points[first, 0], *_summed(values[:, -1], local, first, after)))
+        first = np.append(0, np.flatnonzero(np.isin(own.edges[1:-1], grid)) + 1)
+        after = np.append(first[1:], own.size)
+        found.append((own.edges[first], *_summed(values[:, -1], local, first, after)))
     starts, transition, local = map(np.concatenate, zip(*found, strict=True))
-    window = (span[1] - span[0]) / _WINDOWS
-    ends, slack = np.append(starts, span[1]), 1e-9 * window
-    first = np.flatnonzero(starts + window <= span[1] + slack)
-    after = np.searchsorted(ends, starts[first] + window - slack)  # the edge that ends the window
+    first = np.searchsorted(starts, grid[:-_STARTS])
+    after = np.searchsorted(np.append(starts, stop), grid[_STARTS:])
     return WindowGramians(
-        starts[first], _summed(transition, local, first, after)[1], window
+        mesh.origin + grid[:-_STARTS], _summed(transition, local, first, after)[1], float(window)
     )
 
 
