@@ -511,6 +511,19 @@ def test_a_voltage_that_is_given_tells_nothing_of_what_it_drives():
     assert [name for name, since in found.items() if since is not None] == ["a"]
 
 
+@pytest.mark.parametrize("names", ["abc", "cab", "bca", "cba"])
+def test_a_part_at_rest_that_is_measured_is_known_whatever_it_is_called(names):
+    """Its voltages and current are rounding, and of the other part less is known."""
+    near, far, other = names
+    circuit = from_netlist(
+        f"two parts\nC1 {near} 0 1.33\nR1 {near} 0 1.06\nL1 {near} {far} 0.23\nC2 {far} 0 1.3\n"
+        f"R2 {far} 0 0.35\nV1 s 0 1.05\nR3 {other} s 0.41\nC3 {other} 0 1\nI1 d s -0.33\n"
+        f"R4 d {other} 1.36\nV2 {other} d 0.45\n", measure=f"v({near}), i(R4)", unknown="I1,V2",
+    )
+    found = run(circuit.mapping(), time={"horizon": 3, "samples": 11}).details.estimable
+    assert (found[near], found[far], found["il1"], found[other]) == (0.3, 0.3, 0.3, None)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_state_that_no_parameter_has_part_in_is_no_doubt_in_any_unit(seed):
     """Beside a kernel of G that leaves the others open, and zero as it is."""

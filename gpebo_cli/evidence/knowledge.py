@@ -26,6 +26,7 @@ _NOISE = 1e-12  # of a column of a gain in the states' own units: beyond what ex
 _CLEARED = 1e-11  # of its terms, what an observer clears of a gain
 _MIXED = 1e-14  # over an eigenvalue of N: how far its vector may turn into the kernel's
 _LOST = 1e-3  # of a state: a larger error leaves nothing of it that one would call known
+_REST = 1e-9  # in the states' own units, of the largest: a state that is smaller is nothing
 _HIDDEN = 10.0  # times what is seen of η is what may be hidden in the kernel of N
 _TINY = 1e-100  # squares of its reciprocal are numbers
 
@@ -133,7 +134,11 @@ class Knowledge:
         kernel, slack = self._kernel
         if not kernel.any() and np.isfinite(gain).all():
             return np.ones((len(kernel), gain.shape[1]), dtype=bool)
-        own = gain if units is None else np.where(_is_rounding(gain, units), 0.0, gain)
+        own = gain
+        if units is not None:  # the row of a state that no parameter has part in is rounding
+            size = np.abs(gain) / units[:, None]
+            whole = np.maximum.accumulate(np.fmax.reduce(size, axis=1, initial=0.0))
+            own = np.where(size <= _NOISE * whole[:, None], 0.0, gain)
         scaled, past = (
             x[len(gain) - len(kernel) :] / self.sizes[:, None, :]
             for x in (own, np.maximum.accumulate(np.abs(own)))
@@ -149,8 +154,8 @@ class Knowledge:
     ) -> BoolArray:
         """Of which states (n,) x = offset + gain η something is left beside errors, at the end.
 
-        That is so of one that no parameter has part in, even if it is zero. Neither what the kernel
-        of N leaves open, nor rounding, may amount to more than a thousandth of the others; a small
+        Neither what the kernel of N leaves open, nor rounding, may amount to more than a thousandth
+        of them. Of what is nothing beside the largest, which may be at rest, more may, and a small
         ``growth`` of Φ explains no state that is smaller still beside its terms. Of h = ∫ψᵀY at the
         end (p,), and the offset (N, n) and gain (N, n, p) at all times, NaN where nothing is known;
         ``units`` as for :meth:`states`.
@@ -159,9 +164,9 @@ class Knowledge:
         if small and (self.clarity[-1] >= 1.0).all():
             return np.ones(gain.shape[1], dtype=bool)
         error, z = self.doubt(h, gain[-1])
-        if units is not None:
-            error[_is_rounding(gain, units).all(axis=(0, 2))] = 0.0
         size = np.abs(offset + gain @ z).max(axis=0)
+        if small and units is not None:
+            size = np.maximum(size, _REST * units * np.fmax.reduce(size / units, initial=0.0))
         if small:
             size = np.maximum(size, np.abs(gain[-1]) @ np.abs(z) / LARGE)
         return np.asarray(error <= _LOST * size)
@@ -184,17 +189,6 @@ class Knowledge:
         of_each = np.abs(row @ (told / spectrum[clear]) @ told.T) @ met
         error = unseen + _NOISE * (np.minimum(of_all, of_each) + np.abs(row) @ np.abs(z))
         return np.asarray(error), z / self.sizes[-1]
-
-
-def _is_rounding(gain: Array, units: Array) -> BoolArray:
-    """What of a gain (N, n, p) is rounding beside that of other states so far, in their units.
-
-    All of the row of a state is that no parameter has part in.
-    """
-    own = np.abs(gain)
-    own /= units[:, None]
-    whole = np.maximum.accumulate(np.fmax.reduce(own, axis=1, initial=0.0))
-    return np.asarray(own <= _NOISE * whole[:, None])
 
 
 def knowledge(
