@@ -1267,3 +1267,15 @@ def test_what_disturbs_a_psi_of_next_to_nothing_does_not_move_estimates(estimato
     if estimator == "fct":
         expected = (expected - left * 1.5) / (1.0 - left)
     np.testing.assert_allclose(found.estimates["k"][0], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("estimator", ["power", "drem", "lion"])
+def test_what_disturbs_a_psi_of_next_to_nothing_does_not_move_estimates_at_samples(estimator):
+    pulse = "exp(-((t - 2)/0.3)**2)"
+    regression = {"name": "pulse", "unknowns": {"k": -2}, "psi": [[pulse]],
+                  "Y": [f"-2*{pulse} + 0.5*cos(5*t)"]}
+    both = [gpebo_cli.run(
+        regression=regression, time={"horizon": 5, "samples": 11}, observer=observer,
+        estimator={"name": estimator, "gamma": 10.0, "initial": [1.5], "lambda": 3.0},
+    ).estimates["k"] for observer in ({}, {"sample_time": 0.005, "hold": "linear"})]
+    np.testing.assert_allclose(*both, atol=2e-3)

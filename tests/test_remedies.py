@@ -25,6 +25,7 @@ from test_observer import ROTATING
 from units import Units, in_units
 
 from gpebo_cli import estimators
+from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.evidence.excitation import window_level
 from gpebo_cli.experiment.assumptions import examine
@@ -867,3 +868,27 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
     begin = ExtensionState(np.arange(6.0).reshape(2, 3), 0.0)
     found = filtered(outer, rates, gains, moves, [begin]).final
     np.testing.assert_allclose(found.ravel(), X, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("estimator", "remedy"), [
+    ("least_squares", {"remedy": "reset", "reset_interval": 1.7}),
+    ("ls_drem", {"remedy": "reset", "reset_interval": 1.7}),
+    ("least_squares", {"remedy": "current_coordinates"}),
+])  # fmt: skip
+@pytest.mark.parametrize("centre", [1.0, 2.0, 2.5])
+def test_an_unknown_that_does_next_to_nothing_at_the_start_has_no_unit_of_it(
+    estimator, remedy, centre
+):
+    """F(0) is 1e-44 to 1e-272: that is no unit for what the pulse tells of k, and of the state."""
+    plant = {
+        "name": "pulse", "states": ["x"], "outputs": ["y"], "unknowns": {"k": 1.5}, "E": [[1]],
+        "A": [[-1]], "F": [[f"exp(-((t - {centre})/0.1)**2)"]], "C": [[1]],
+        "initial_state": [0.3],
+    }
+    found = api_run(
+        plant, estimator=estimator, time={"horizon": 6, "samples": 31},
+        observer={"name": "gpebo", **remedy},
+    )
+    assert all(found.details.estimable[name] is not None for name in ("x", "k"))
+    assert abs(found.errors["k"][0, -1]) < 1e-4
+    assert abs(found.errors["x"][0, -1]) < 1e-6

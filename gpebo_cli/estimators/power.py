@@ -271,8 +271,12 @@ class RecursivePower:
         out = np.empty((len(self._eta), len(goal), goal.shape[1]))
         for k, towards in enumerate(goal):
             error = towards - self._eta
-            left = np.abs(error) ** rest - rest * self._gains * energy[k]
-            self._eta = towards - np.sign(error) * np.maximum(left, 0.0) ** (1.0 / rest)
+            size, gone = np.abs(error), rest * self._gains * energy[k]
+            share = np.minimum(gone / np.maximum(size**rest, np.maximum(gone, _NOTHING)), 1.0)
+            # What is left of a large error would hide how far η̂ moves.
+            with np.errstate(divide="ignore"):
+                moved = error * -np.expm1(np.log1p(-share) / rest)
+            self._eta = np.where(share < 1.0, self._eta + moved, towards)
             out[:, k] = self._eta
         self._energy += float(energy.sum())
         if mixed.usable.any():

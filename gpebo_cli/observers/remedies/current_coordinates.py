@@ -33,6 +33,7 @@ from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
 
 # Times and where jumps are decided, (2, K, s + 1); the rest at these; what the mesh has to resolve.
+_APART = 1e4  # times what w does to itself: beside more float64 numbers lose it
 _Evaluated: TypeAlias = tuple[
     Array, Assembled, Array, tuple[float, float], list[tuple[Array, float]]
 ]
@@ -72,7 +73,13 @@ class CurrentCoordinates:
         p = q + k
         reduced.signals.check_memory(system, more=k * (p + 1))
         units = np.concatenate([reduced.form.units.unknowns, reduced.units])
-        start = reduced.first.at_first
+        duration = float(reduced.mesh.edges[-1] - reduced.mesh.edges[0])
+        # What an unknown does at the start is no unit of it where it does much more later on.
+        first, of_w = reduced.first, units[q:]
+        rate = max(np.abs(first.dynamics * of_w / of_w[:, None]).max(initial=0.0), 1.0 / duration)
+        does = np.abs(first.from_unknowns / of_w[:, None]).max(axis=(0, 1), initial=0.0)
+        units[:q] = np.minimum(units[:q], _APART * rate / np.maximum(does, np.finfo(float).tiny))
+        start = first.at_first
         size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
         past = np.zeros((2, 0, len(reduced.mesh.rule.points)))
 

@@ -39,6 +39,7 @@ _GROWTH = 100.0  # of Φ between resets: two digits
 _TOLERANCE = 1e-6  # of Φ, where only its size matters
 _MOST = 10_000  # resets in one run
 _FLOOR = 1e-3  # of the size of w and θ: parameters are resolved to so much, relatively
+_APART = 1e8  # times the energy of a state's error: beside more float64 numbers lose it
 _KNOWN = 1e-10  # eigenvalues of G below this share of the largest say nothing about w
 
 
@@ -97,7 +98,11 @@ def _restart(
     q, dual = reduced.system.q, begin.dual
     end = reduced.basis @ extension.trajectory.final
     xi_a, xi_b, Phi = end[:, 0], end[:, 1 : 1 + q], end[:, 1 + q :]
-    units = np.broadcast_to(units, len(known.values))
+    units = np.array(np.broadcast_to(units, len(known.values)))
+    # What an unknown does at the start is no unit of it where it does much more by now.
+    energy = np.maximum(known.values.diagonal(), np.finfo(float).tiny)
+    if (most := _APART * (units**2 * energy)[q:].max(initial=0.0)) > 0.0:
+        units[:q] = np.minimum(units[:q], np.sqrt(most / energy[:q]))
     own = units[:, None] * known.values * np.append(units, 1.0)
     eta = units * (np.linalg.pinv(own[:, :-1], rcond=_KNOWN, hermitian=True) @ own[:, -1])
     reached = xi_a + xi_b @ eta[:q] - Phi @ eta[q:]
@@ -106,7 +111,7 @@ def _restart(
     transform = np.eye(p)
     transform[q:, :q], transform[q:, q:] = -dual @ xi_b, dual @ Phi
     shift = np.concatenate([np.zeros(q), dual @ (after - xi_a)])
-    of_states, of_unknowns = reduced.form.units.states, reduced.form.units.unknowns
+    of_states, of_unknowns = reduced.form.units.states, units[:q]
     floor = _FLOOR * max(
         float(np.abs(part).max(initial=0.0)) for part in (eta[:q] / of_unknowns, after / of_states)
     )
