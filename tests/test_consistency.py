@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import one_state
 from processes import refused
+from random_systems import random_system
+from units import Units, drawn, in_units
 
 from benchmarks.honesty import made
 from gpebo_cli import load_plant
@@ -536,3 +538,21 @@ def test_equations_that_leave_a_state_open_are_refused_with_the_first_time():
     said = "plant p: the equations do not determine the state near t = 1.25"
     with refused(said, by=ModelError):
         _refuse_undetermined(plant, np.array([False, True, True]), t)
+
+
+def test_rounding_that_constraints_show_is_some_digits_of_states_in_any_units():
+    """Equations times factors keep their solutions, which miss them by rounding alone."""
+    content, found = random_system(3)[0], []
+    by = drawn(np.random.default_rng(5), plant_from_mapping(content), decades=True)
+    for units in (Units(*map(np.ones_like, by[:-1]), 1.0), by):
+        system, T = plant_from_mapping(in_units(content, units)), float(units.time)
+        run = simulate(system, TimeSettings(horizon=T), SolverSettings())
+        mesh, x = run.signals.states.mesh, run.signals.states.values[:, -1] / units.states
+        found.append(reductions.shown_rounding(
+            system, run.structure, mesh.points[:, -1], mesh.inside[:, -1],
+            (x * units.states)[..., None],
+        )[:, 0] / np.abs(units.states) / np.abs(x).max())
+    assert (found[0] < 3e-14).all()
+    seen = found[0] > 1e-17
+    assert seen.sum() >= 3
+    np.testing.assert_allclose(np.log10(found[1][seen]), np.log10(found[0][seen]), atol=1.0)

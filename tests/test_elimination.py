@@ -78,6 +78,18 @@ def test_pivots_that_harm_are_seen():
     assert series.solve(problem, equation, mesh, **limits).error_estimate < 1e-6
 
 
+def test_series_rest_where_nothing_moves_and_are_cut_elsewhere():
+    def equation(mesh):
+        moves = np.where(mesh.inside.ravel() < 1.0, 0.0, -6.0)
+        return sparse(moves[:, None, None] * np.eye(D)), np.zeros((1, D, 1)), ()
+
+    problem, mesh = LinearProblem(None, np.ones((D, 1))), Mesh(np.arange(3.0), RULE)
+    found = series.solve(problem, equation, mesh, units=np.ones(D), tol=1e-6, max_elements=99)
+    x, edges = found.trajectory.values[..., 0, 0], found.trajectory.mesh.edges
+    np.testing.assert_array_equal(edges[:2], [0.0, 1.0])
+    np.testing.assert_allclose(x[:, -1], np.exp(-6.0 * (edges[1:] - 1.0)), atol=1e-4)
+
+
 def test_what_elimination_fills_is_refused():
     A = np.random.default_rng(3).normal(size=(1, 60, 60))
     A[0][np.random.default_rng(4).uniform(size=(60, 60)) < 0.75] = 0.0

@@ -25,6 +25,7 @@ from gpebo_cli.observers import Measurements, build, gpebo
 from gpebo_cli.observers._base import SignalNoise
 from gpebo_cli.observers.reduced import condensed, extension
 from gpebo_cli.observers.reduced import system as reduced
+from gpebo_cli.observers.reduced.regression import Assembled
 from gpebo_cli.recordings.hold import held, recording_mesh
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.regression import linear
@@ -187,6 +188,32 @@ def test_a_long_mesh_is_solved_window_by_window(plant, horizon, estimator, monke
         if isinstance(value, float)
     } for each in results)
     assert other == pytest.approx(one, rel=1e-6)
+
+
+def test_windows_together_have_the_largest_errors_and_sizes_of_each():
+    """And the weakest singular value; the terms of ψ are as large as they were so far."""
+    def part(start, error, size, weakest):
+        made = mesh.initial_mesh(start, start + 1.0, [], 1, radau_rule(2))
+        signals = [np.full((3, *shape), size) for shape in ((1,), (1, 2), (2,), (2, 2))]
+        found = Assembled(
+            *signals, size, np.array([size, 2.0]), np.zeros(2, dtype=bool),
+            np.array([[size, 1.0, 3.0 - size]]), np.array([[3.0 - size, 1.0], [0.0, size]]),
+        )
+        z = Trajectory(made, np.full((1, 3, 1, 3), size))
+        return extension.Extension(z, error, found, np.array([[size, 2.0]]), (weakest, start))
+
+    whole = extension.joined([
+        part(0.0, 0.5, 1.0, 0.3), part(1.0, 0.25, 2.0, 0.1), part(2.0, 0.125, 0.5, 0.2),
+    ])
+    found = whole.assembled
+    assert (whole.error_estimate, whole.weakest, found.Y_scale) == (0.5, (0.1, 1.0), 2.0)
+    assert whole.mesh.edges.tolist() == [0.0, 1.0, 2.0, 3.0]
+    assert whole.scale.tolist() == [[1.0, 2.0], [2.0, 2.0], [2.0, 2.0]]
+    assert found.column_scale.tolist() == [2.0, 2.0]
+    assert found.largest.tolist() == [[2.0, 1.0, 2.5]]
+    assert found.moving.tolist() == [[2.5, 1.0], [0.0, 2.0]]
+    for values in (whole.trajectory.values, found.Y, found.psi, found.offset, found.gain):
+        assert values.reshape(3, -1).min(axis=1).tolist() == [1.0, 2.0, 0.5]
 
 
 @pytest.mark.parametrize(("observer", "estimator"), [

@@ -131,7 +131,7 @@ def test_jumps_of_a_recorded_signal_come_out_of_delays_exactly(step):
     mesh = initial_mesh(0.0, 10.0, [], 10, radau_rule(9))
     both = np.stack([np.where(mesh.inside > 3.0, step, 0.0), np.sin(mesh.points)], axis=2)
     found, _ = model.on(Trajectory(mesh, both), None, 1e-12, 1_000)
-    assert 3.35 in found.mesh.edges
+    assert np.isin([3.35, 1.35, 7.35], found.mesh.edges).tolist() == [True, False, False]
     assert found.mesh.size < 40
     expected = np.stack([step * np.maximum(T - 3.35, 0.0), np.sin(T)], axis=1)
     np.testing.assert_allclose(found.Y(T), expected, atol=1e-10)

@@ -793,3 +793,14 @@ def test_known_functions_are_looked_at_evenly_within_each_element():
     looks = place.shape[1]
     expected = (np.arange(looks) + 0.5) / looks
     np.testing.assert_allclose(place, np.tile(expected, (mesh.size, 1)), rtol=1e-6)
+
+
+def test_a_little_state_is_compared_with_a_share_of_the_largest_by_ivp():
+    """Of 1e-14 beside 1 its steps know nothing, and 1e-9 is what it is measured by."""
+    plant = one_state(
+        states=["a", "b"], E=[[1, 0], [0, 1]], A=[[-1, 0], [0, -20]], C=[[1, 0]],
+        initial_state=[1, 1e-14],
+    )
+    solver = SolverSettings("ivp")
+    errors = simulate(plant_from_mapping(plant), TimeSettings(horizon=0.5), solver).state_errors
+    assert errors.max() < 1e-4

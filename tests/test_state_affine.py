@@ -70,6 +70,18 @@ def test_the_solution_is_that_of_another_method(plant, right_side, horizon):
     assert found.error_estimate < 1e-9
 
 
+def test_an_unknown_in_an_output_that_the_matrices_follow():
+    """x' = −y x with y = x + c: 1/x is an exponential."""
+    system = plant_from_mapping(one_state(
+        A=[["-y"]], unknowns={"k": 2.0}, F=[[0]], H=[[0.25]], initial_state=[1.0],
+    ))
+    found = simulate(system, TimeSettings(horizon=3.0), SOLVER)
+    t, c = np.linspace(0.0, 3.0, 31), 0.5
+    expected = c / ((1.0 + c) * np.exp(c * t) - 1.0)
+    np.testing.assert_allclose(found.signals.states(t)[:, 0], expected, rtol=1e-8)
+    np.testing.assert_allclose(found.signals.outputs(t)[:, 0], expected + c, rtol=1e-8)
+
+
 def test_a_mildly_nonlinear_plant_costs_few_linear_solves():
     effort = simulate(boost(), TimeSettings(horizon=3.0), SOLVER).effort
     assert effort.windows == 1

@@ -12,8 +12,8 @@ _SMALL = 24  # states, up to which NumPy's calls cost more than plain loops
 
 def in_frame(*arguments: Array) -> tuple[Array, ...] | None:
     """In C."""
-    E, A, B, F, C, rows, scale, *_, kernel, equations = arguments
-    if len(rows) > _SMALL or len(equations) + len(scale) < kernel.shape[1]:
+    E, A, B, F, C, rows, *_ = arguments
+    if len(rows) > _SMALL:
         return None
     of_A = max(len(A), len(C))
     found: tuple[Array, ...] = _compiled.in_frame(
