@@ -351,6 +351,8 @@ def test_numbers_are_accepted_up_to_their_limits(section, key, low, high):
         made = configuration.settings({section: words}, draw=False)
         return getattr(getattr(made, section), key)
 
+    usual = getattr(getattr(Settings({}), section), key)
+    assert usual in {None, "column"} or low <= usual <= high
     whole = not isinstance(low, float)
     for end, step in ((low, -1), (high, 1)):
         if np.isfinite(end):

@@ -283,7 +283,7 @@ def test_bounds_hold_in_any_units():
         )
         return found.estimates["h1"][0] / unit
 
-    np.testing.assert_allclose(bounded(1e-6), bounded(1.0), atol=1e-6)
+    np.testing.assert_allclose(bounded(1e-12), bounded(1.0), atol=1e-6)
 
 
 def test_bounds_are_told_in_the_order_of_time():

@@ -136,6 +136,7 @@ def test_roots_of_polynomials_that_change_sign_are_all_found(places, function, p
         ("max(t**2, 9)", [3]),
         ("min(exp(-((t - 7.1)/1e-4)**2), 0.5)", 7.1 + 1e-4 * np.log(2) ** 0.5 * np.array([-1, 1])),
         ("sign(sin(3.1415926535*t) + 1e9)", []), ("abs((t - 10)*(t + 1))", [10]),
+        ("step(t + 3*t - 8)", [2]), ("abs(4 - t - t)", [2]),
     ],
 )  # fmt: skip
 def test_selected_breakpoints(text, times):

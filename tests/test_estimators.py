@@ -797,6 +797,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
         ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, r"\(0, 301, 5\) needs .* ±300"),
         ({"name": "drem", "gamma": "logspace(0, -301, 5)"}, "±300"),
+        ({"name": "drem", "gamma": "logspace(-301, 0, 5)"}, "±300"),
         ({"name": "drem", "gamma": "logspace(0, 1, 2.5)"}, r"\(0, 1, 2\.5\) needs .* whole num"),
         ({"name": "drem", "gamma": "import os"}, "not a positive number"),
         ({"name": "drem", "gamma": float("nan")}, "positive number"),

@@ -598,6 +598,21 @@ def test_a_hanging_pendulum_swings_by_the_force_of_its_rod():
     }
 
 
+def test_entries_of_a_mechanism_may_be_numbers_and_text_of_either_sign():
+    """M q'' + D q' + K q = B u."""
+    draft = from_mechanics({
+        "M": [["m", 0], [0, 3]], "D": [["-c", "2*c"], [0.5, -4]], "K": [["1 + t", -7], [0, "k"]],
+        "B": [["m"], [-2]], "inputs": {"u": "sin(t)"}, "measure": ["q1"],
+        "parameters": {"m": 2, "c": 0.25, "k": 9},
+    }, "m")
+    found = plant_from_mapping(draft.mapping()).coefficients.taylor(np.array([0.5]), 0)
+    D, K = np.array([[-0.25, 0.5], [0.5, -4.0]]), np.array([[1.5, -7.0], [0.0, 9.0]])
+    none, one = np.zeros((2, 2)), np.eye(2)
+    np.testing.assert_allclose(found.E[0, 0], np.block([[one, none], [none, np.diag([2.0, 3.0])]]))
+    np.testing.assert_allclose(found.A[0, 0], np.block([[none, one], [-K, -D]]))
+    np.testing.assert_allclose(found.B[0, 0].ravel(), [0.0, 0.0, 2.0, -2.0])
+
+
 def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
     """Index 3, against the equation of the crank's angle alone, which has no constraints."""
     model = {

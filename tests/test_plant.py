@@ -483,3 +483,15 @@ def test_numbers_of_any_size_are_a_result_or_one_reason(key: str, value: object)
         warnings.simplefilter("error")
         with suppress(GpeboError):
             run(changed, observer="none", time={"horizon": 1, "samples": 3})
+
+
+@pytest.mark.parametrize("name", ["E", "A"])
+def test_some_entries_of_a_matrix_are_those_of_the_whole_and_the_others_stay(name):
+    whole, t = shipped("circuit").coefficients.assembly, np.linspace(0.0, 2.0, 5)
+    every = dict(zip(MATRIX_NAMES, whole.taylor(t, 1), strict=True))
+    own = np.arange(every[name][0, 0].size) % 3 == 0
+    part = whole.of(MATRIX_NAMES, {name: own}).taylor(t, 1)
+    for key, found in zip(MATRIX_NAMES, part, strict=True):
+        matrix = every[key]
+        expected = matrix.reshape(*matrix.shape[:2], -1)[..., own] if key == name else matrix
+        np.testing.assert_array_equal(found, np.broadcast_to(expected, found.shape))

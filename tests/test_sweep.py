@@ -30,6 +30,7 @@ from gpebo_cli.cli.sweep import _launch, _overrides, _print_table, _raise_failur
 from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results import sweep_folder
+from gpebo_cli.results.names import METRICS, SETTLED
 from gpebo_cli.results.sweep_folder import JobRecord, Plan, read_plan, read_record, write_record
 
 FAST = ["figures=none", "time.samples=51"]
@@ -375,6 +376,14 @@ def test_of_a_long_table_and_of_many_failures_the_first_ones_are_told(
     with refused("the launcher gave up: it died", by=GpeboError):
         _raise_failures(records[7:], tmp_path / "s", "it died", stopped=False)
     _raise_failures(records[7:], tmp_path / "s", "", stopped=False)
+
+
+def test_a_table_of_jobs_with_noise_leaves_out_what_is_chance_under_noise(tmp_path, capsys):
+    case = {"gamma": 2.0, SETTLED: 3.0, **dict.fromkeys(METRICS, 0.5)}
+    records = [JobRecord(k, {"a": str(k)}, "done", 0.5, "", cases=[case]) for k in range(2)]
+    _print_table(records, tmp_path, rows=True)
+    head = capsys.readouterr().out.split("\n", 1)[0].split()
+    assert head[:-1] == ["job", "a", "status", "case", "gamma", SETTLED, *list(METRICS)[2:]]
 
 
 def test_a_terminal_is_shown_stages_that_take_long_unless_they_are_printed(monkeypatch):
