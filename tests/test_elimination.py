@@ -81,7 +81,7 @@ def test_pivots_that_harm_are_seen():
 def test_series_rest_where_nothing_moves_and_are_cut_elsewhere():
     def equation(mesh):
         moves = np.where(mesh.inside.ravel() < 1.0, 0.0, -6.0)
-        return sparse(moves[:, None, None] * np.eye(D)), np.zeros((1, D, 1)), ()
+        return by_entries(moves[:, None, None] * np.eye(D)), np.zeros((1, D, 1)), ()
 
     problem, mesh = LinearProblem(None, np.ones((D, 1))), Mesh(np.arange(3.0), RULE)
     found = series.solve(problem, equation, mesh, units=np.ones(D), tol=1e-6, max_elements=99)
