@@ -65,6 +65,7 @@ _ROUNDING = 8.0 * float(np.finfo(float).eps)  # of the terms of a sum
 _INITIAL_VARIANCE = 10.0  # of what observer.P0 leaves out
 _NOTHING = 1e-28  # of the square of the largest row: rounding
 _HELD = 7.0  # times what a regression takes: pairs of 2 n by n + 1, and what they follow; measured
+_ALIKE = 1.0 + 1e-6  # times a number: what rounding makes of it
 _EXACT = 1e-4  # of the variance that would regularise it: what noise leaves below is exact
 
 
@@ -469,7 +470,7 @@ def _uniform_observability(
     values = np.linalg.eigvalsh(M)
     rank = q + len(known.begin.names)
     smallest = np.maximum(values[:, n - rank], 0.0)
-    k = int(np.argmin(smallest))
+    k = int(np.argmax(smallest <= smallest.min() * _ALIKE))  # the first of those that are alike
     level, at, window = float(smallest[k]), float(windows.starts[k]), windows.window
     needed = _LEVEL * float(values.max(initial=0.0))
     return Requirement(
