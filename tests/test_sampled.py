@@ -76,7 +76,7 @@ def test_what_is_left_of_an_error_is_told_in_no_units(name):
         return law.requirement.evidence["left_of_the_initial_error"]
 
     gains = np.array([0.02, 0.01, 0.03])
-    assert 1e-6 < left(made, gains) < 0.9
+    assert 1e-6 < left(made, gains) < 0.999
     assert left(other, gains / size**2) == pytest.approx(left(made, gains), rel=1e-6)
 
 
