@@ -17,7 +17,7 @@ equation (Reid; Bittanti, Laub & Willems, The Riccati Equation, 1991):
 
 Half of its solutions grow as fast as the filter forgets, so X₁ and X₂ soon differ by rounding only
 in the directions that do not grow. At every edge of the mesh the same P and ζ̂ therefore start
-anew from (I, P | 0, ζ̂). One batched solve gives the Hamiltonian's transition of every element;
+anew from (I, P | 0, ζ̂). The Hamiltonian's transition of every element does not depend on them;
 what is chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹.
 """
 
