@@ -1280,3 +1280,23 @@ def test_what_disturbs_a_psi_of_next_to_nothing_does_not_move_estimates_at_sampl
         estimator={"name": estimator, "gamma": 10.0, "initial": [1.5], "lambda": 3.0},
     ).estimates["k"] for observer in ({}, {"sample_time": 0.005, "hold": "linear"})]
     np.testing.assert_allclose(*both, atol=2e-3)
+
+
+@pytest.mark.parametrize("start", [0.0, 0.1])
+def test_a_memory_that_begins_with_the_data_is_soon_resolved(monkeypatch, start):
+    """One over its length has an integral that grows without end toward the start."""
+    rounds, path = [], estimators._scalar.scalar_path
+    monkeypatch.setattr(
+        estimators._scalar, "scalar_path", lambda *given: rounds.append(1) or path(*given)
+    )
+    t = np.arange(4) / 10.0
+    plant = {
+        "name": "p", "states": ["x"], "inputs": {"V": 0}, "outputs": ["y"], "E": [[1]],
+        "A": [[-1]], "B": [[1]], "C": [[1]], "initial_state": [1],
+    }
+    found = gpebo_cli.run(
+        plant, estimator="ls_drem", data={"t": t, "V": 1.0 + 0 * t, "y": 10.0 * t},
+        time={"start": start},
+    )
+    assert found.details.estimation.requirement.holds
+    assert 0 < len(rounds) < 60

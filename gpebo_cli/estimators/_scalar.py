@@ -46,6 +46,7 @@ _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
 _BESIDE = 1e5  # times η̂: 1e-10 of it is left of its digits beside such an η̄
 _BLIND = 1e-6  # tail of Δ² that is more than rounding, whatever a cut has made of it
+_SHORTEST = 1e-13  # of the largest time: what happens in elements that are shorter is not resolved
 _RISES = 16  # elements at most in which Δ rises: more of them are rounding
 _ONE = np.ones(1)
 _STRETCH = 2048  # elements that are refined together: memory does not grow with the horizon
@@ -78,7 +79,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     λ in 1/s is (p,) or whatever broadcasts against the signal. It starts at 0 or ``start``.
     """
     edges = signal.mesh.edges
-    smallest = 1e-13 * float(np.abs(edges[[0, -1]]).max())
+    smallest = _SHORTEST * float(np.abs(edges[[0, -1]]).max())
     fastest = float(np.max(rate))
     while True:
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
@@ -396,7 +397,8 @@ def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
         # if the element is not far too long for what is in it. Of those there are a few.
         much, better = lost > _TOLERANCE, lost < 0.05 * before
         rounding = _SLACK * _ROUNDING / np.maximum(path.digits.max(axis=1), _ROUNDING)
-        rises = much & ~better & (share > np.maximum(_BLIND, rounding))
+        long = mesh.steps > _SHORTEST * np.abs(mesh.edges[[0, -1]]).max()
+        rises = much & ~better & long & (share > np.maximum(_BLIND, rounding))
         poor = (much & better) | (rises & (rises.sum() <= _RISES))
         if not poor.any() or mesh.size > MAX_ELEMENTS:
             return path
