@@ -1228,20 +1228,6 @@ def test_persistent_excitation_is_asked_of_the_smallest_gain():
     assert str(beside) != str(estimate("gradient", CLEAN, gamma=8.0).requirement)
 
 
-@pytest.mark.parametrize("f0", [1e-2, 1e-4, 1e-7])
-def test_a_delta_that_rises_within_a_small_part_of_an_element_is_followed(f0):
-    """Δ = G/(f₀ + G) with G = t, and ∫Δ² in closed form: a cut in four alone tells nothing."""
-    found = gpebo_cli.run(
-        regression={"name": "steep", "unknowns": {"k": -1.84}, "psi": [["cos(t)"], ["sin(t)"]]},
-        estimator={"name": "ls_drem", "gamma": 10.0, "f0": f0}, time={"horizon": 2, "samples": 21},
-    )
-    t = found.t
-    energy = t - 2.0 * f0 * np.log1p(t / f0) + f0 - f0 * f0 / (f0 + t)
-    np.testing.assert_allclose(
-        found.errors["k"][0], 1.84 * np.exp(-10.0 * energy), rtol=1e-7, atol=1e-12
-    )
-
-
 @pytest.mark.parametrize(("estimator", "gamma", "rate"), [
     ("lion", 0.1, 0.022), ("drem", 10.0, 120.0), ("fct", 1e4, 3.0),
 ])  # fmt: skip

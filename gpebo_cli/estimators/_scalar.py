@@ -45,9 +45,7 @@ _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one o
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
 _BESIDE = 1e5  # times η̂: 1e-10 of it is left of its digits beside such an η̄
-_BLIND = 1e-6  # tail of Δ² that is more than rounding, whatever a cut has made of it
 _SHORTEST = 1e-13  # of the largest time: what happens in elements that are shorter is not resolved
-_RISES = 16  # elements at most in which Δ rises: more of them are rounding
 _ONE = np.ones(1)
 _STRETCH = 2048  # elements that are refined together: memory does not grow with the horizon
 _LANES = 1 << 22  # numbers in one batch of gains
@@ -393,13 +391,8 @@ def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
         share = legendre_tail(path.weight[..., None] / size[:, None, None], mesh.rule, _ONE)[:, 0]
         gain = np.clip(1.0 / np.maximum(begin, np.finfo(float).tiny), least, most)
         lost = gain * mesh.steps * size * share * np.exp(-gain * begin)
-        # A quarter of an element has a quarter of what is rounding, and much less of what is not,
-        # if the element is not far too long for what is in it. Of those there are a few.
-        much, better = lost > _TOLERANCE, lost < 0.05 * before
-        rounding = _SLACK * _ROUNDING / np.maximum(path.digits.max(axis=1), _ROUNDING)
-        long = mesh.steps > _SHORTEST * np.abs(mesh.edges[[0, -1]]).max()
-        rises = much & ~better & long & (share > np.maximum(_BLIND, rounding))
-        poor = (much & better) | (rises & (rises.sum() <= _RISES))
+        # A quarter of an element has a quarter of what is rounding, and much less of what is not.
+        poor = (lost > _TOLERANCE) & (lost < 0.05 * before)
         if not poor.any() or mesh.size > MAX_ELEMENTS:
             return path
         parts = np.where(poor, 4, 1)
