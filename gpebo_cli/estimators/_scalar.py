@@ -45,8 +45,6 @@ _ROUNDING = 1e-15  # relative error of Ω; σ_max/σ_min times that is the one o
 _UNKNOWN = 0.1  # relative error of 𝐘/Δ from which on it says nothing
 _SLACK = 30.0  # how far above its mean rounding may show in a polynomial's last coefficients
 _BESIDE = 1e5  # times η̂: 1e-10 of it is left of its digits beside such an η̄
-_SHORTEST = 1e-13  # of the largest time: what happens in elements that are shorter is not resolved
-_ONE = np.ones(1)
 _STRETCH = 2048  # elements that are refined together: memory does not grow with the horizon
 _LANES = 1 << 22  # numbers in one batch of gains
 # Below this reciprocal condition number of Ω the quotient 𝐘/Δ is rounding noise. It is not needed
@@ -77,7 +75,7 @@ def low_pass(signal: Trajectory, rate: Array, start: Array | None = None) -> Tra
     λ in 1/s is (p,) or whatever broadcasts against the signal. It starts at 0 or ``start``.
     """
     edges = signal.mesh.edges
-    smallest = _SHORTEST * float(np.abs(edges[[0, -1]]).max())
+    smallest = 1e-13 * float(np.abs(edges[[0, -1]]).max())
     fastest = float(np.max(rate))
     while True:
         filtered, mesh = signal.low_pass(rate, start), signal.mesh
@@ -387,10 +385,10 @@ def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
     before: Array | float = np.inf  # what was lost in the element that each one was cut from
     while True:
         mesh, begin = path.mesh, path.energy[:, 0]
-        size = np.maximum(path.weight.max(axis=1), np.finfo(float).tiny)
-        share = legendre_tail(path.weight[..., None] / size[:, None, None], mesh.rule, _ONE)[:, 0]
+        size = np.maximum(path.weight.max(axis=1), np.finfo(float).tiny)[:, None]
+        tail = mesh.steps * legendre_tail(path.weight[..., None], mesh.rule, size)[:, 0]
         gain = np.clip(1.0 / np.maximum(begin, np.finfo(float).tiny), least, most)
-        lost = gain * mesh.steps * size * share * np.exp(-gain * begin)
+        lost = gain * tail * np.exp(-gain * begin)
         # A quarter of an element has a quarter of what is rounding, and much less of what is not.
         poor = (lost > _TOLERANCE) & (lost < 0.05 * before)
         if not poor.any() or mesh.size > MAX_ELEMENTS:

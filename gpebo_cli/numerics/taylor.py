@@ -125,8 +125,7 @@ def march(
         forced = _powers(_degrees(there, largest, rule, tol), parts[some])
         pieces.append(elements.series(
             nodes, mesh.steps[some], parts[some], A.rows, A.columns, terms.swapaxes(1, 2),
-            _from_each_on(decay),
-            forced.reshape(*forced.shape[:2], *f.shape[1:]),
+            _from_each_on(decay), forced.reshape(*forced.shape[:2], *f.shape[1:]),
             None if kicks is None else kicks[some], start, weights, tol, SHARE,
         ))
         start = pieces[-1][0][-1, -1] + (0.0 if kicks is None else kicks[some][-1])
@@ -158,14 +157,13 @@ def element_maps(rule: RadauRule, h: Array, A: Array, f: Array) -> tuple[Array, 
     """
     (K, s), (n, columns) = (len(h), rule.stages), f.shape[1:]
     matrix, forcing = by_entries(A), np.flatnonzero(f.any(axis=(0, 1)))
-    tol, c = 8.0 * EPS, len(forcing)
-    rates = matrix.norms(matrix.sizes(K), np.ones(n))
+    tol, c, of_rows = 8.0 * EPS, len(forcing), np.ones(n)
+    rates = matrix.norms(matrix.sizes(K), of_rows)
     size = np.maximum(largest_over_time(matrix.entries), TINY)
     degrees = _degrees(matrix.entries, size, rule, tol)
     parts = _parts(_largest_shares(_powers(degrees), size), tol)
     parts = np.maximum(np.ceil(h * rates / LENGTH), parts)
-    unknowns = s * n
-    work = _TERMS * degrees.shape[1] * len(size) * (n + c) * parts.sum()
+    unknowns, work = s * n, _TERMS * degrees.shape[1] * len(size) * (n + c) * parts.sum()
     if not work < K * unknowns**2 * (unknowns / 3 + n + columns):
         return None
     parts = parts.astype(np.intp)
@@ -183,7 +181,7 @@ def element_maps(rule: RadauRule, h: Array, A: Array, f: Array) -> tuple[Array, 
         values, change = elements.series(
             rule.nodes, h[k : k + 1], parts[k : k + 1], matrix.rows, matrix.columns,
             terms[some].swapaxes(1, 2), decay[some], forced if len(f) == 1 else forced[some],
-            None, start, np.ones(n), tol, SHARE,
+            None, start, of_rows, tol, SHARE,
         )
         if not np.isfinite(change).all():
             return None

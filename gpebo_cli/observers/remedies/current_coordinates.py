@@ -32,8 +32,8 @@ from gpebo_cli.observers.reduced.system import ReducedSystem
 from gpebo_cli.regression.dynamics import Dynamics
 from gpebo_cli.regression.linear import LinearRegression
 
-# Times and where jumps are decided, (2, K, s + 1); the rest at these; what the mesh has to resolve.
 _APART = 1e4  # times what w does to itself: beside more float64 numbers lose it
+# Times and where jumps are decided, (2, K, s + 1); the rest at these; what the mesh has to resolve.
 _Evaluated: TypeAlias = tuple[
     Array, Assembled, Array, tuple[float, float], list[tuple[Array, float]]
 ]
