@@ -18,7 +18,7 @@ from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import OnDemand
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics import series
+from gpebo_cli.numerics import series, taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
@@ -813,8 +813,13 @@ for imported in ("math", "scipy.linalg"):
     assert done.stdout.splitlines() == ["[1]", "[1, 1]"]
 
 
-def test_elements_that_are_cut_may_have_more_entries():
-    d = 12
+def test_elements_that_are_cut_may_have_more_entries(monkeypatch):
+    """And what comes before the first of them is not solved again."""
+    d, begun, march = 12, [], taylor.march
+    monkeypatch.setattr(
+        taylor, "march", lambda units, mesh, *rest: (begun.append(mesh.edges[0]),
+                                                     march(units, mesh, *rest))[1],
+    )
 
     def coefficients(t, inside):
         """A narrow coupling, and within it one that is zero at all points of the first mesh."""
@@ -831,6 +836,10 @@ def test_elements_that_are_cut_may_have_more_entries():
     found = series.solve_dense(problem, mesh, tol=1e-9, max_elements=500)
     last = found.trajectory.mesh
     assert last.size > mesh.size
+    assert max(begun) > 2.5
+    once = series.solve_dense(problem, last, tol=1e-9, max_elements=500)
+    np.testing.assert_allclose(found.trajectory.values, once.trajectory.values, atol=1e-10)
+    np.testing.assert_allclose(found.errors, once.errors, rtol=0.1)
     again = coefficients(last.points.ravel(), None).extras[0]
     np.testing.assert_array_equal(found.extras[0].reshape(again.shape), again)
     assert not first.any()

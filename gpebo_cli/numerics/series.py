@@ -64,11 +64,19 @@ def solve(
             mesh = mesh.split(parts.astype(np.intp))[0]
     del A  # another one would be as much again
 
-    def evaluate(mesh: Mesh, before: _Found | None, _kept: IntArray) -> tuple[_Found, Array]:
+    def evaluate(mesh: Mesh, before: _Found | None, kept: IntArray) -> tuple[_Found, Array]:
+        # What comes before the first element that was cut is as it was.
+        front, start = int(np.argmax(kept < 0)), problem.start
+        if before is not None and front:
+            done = before.trajectory.values[:front].copy(), before.change[:front].copy()
+            start = done[0][-1, -1]
         del before
         A, f, extras = equation(mesh)
         enough = max(_DIGITS * tol, 8.0 * EPS)
-        values, change = march(mesh, A, f, None, problem.start, enough)
+        there = f if len(f) == 1 else f[len(f) // mesh.size * front :]
+        values, change = march(*_part(mesh, A, front), there, None, start, enough)
+        if front:
+            values, change = map(np.concatenate, zip(done, (values, change), strict=True))
         if (change[np.isfinite(change)] > 8.0 * enough).any() or not np.isfinite(values[-1]).all():
             raise StiffError
         looked = Looked.at(values, mesh.rule)
@@ -136,6 +144,14 @@ class _Found(NamedTuple):
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
     moved: Array  # (K, d, c) what rounding of the equation's terms moves
     extras: tuple[Array, ...]
+
+
+def _part(mesh: Mesh, A: Sparse, first: int, last: int | None = None) -> tuple[Mesh, Sparse]:
+    """Some elements of a mesh, and A there."""
+    if len(A.entries) > 1:
+        points = mesh.rule.stages + 1
+        A = A._replace(entries=A.entries[points * first : last and points * last])
+    return replace(mesh, edges=mesh.edges[first : last and last + 1]), A
 
 
 def by_factors(A: Sparse) -> March:
@@ -219,16 +235,13 @@ def _errors(
     ends, left = np.empty_like(kicks), np.empty(K)
     count = _AT_ONCE if stiff else K
     for first in range(0, K, count):
-        part, some = slice(first, first + count), slice(points * first, points * (first + count))
-        forcing = np.zeros((1, n, 0))
+        part, forcing = slice(first, first + count), np.zeros((1, n, 0))
         if stiff:
             slopes = 2.0 * signs[1:][part] * (moved[part] / h[part])[:, :, None]
             forcing = rule.points[:, None, None] * slopes.reshape(-1, 1, *start.shape)
             forcing = forcing.reshape(-1, *start.shape)
         found_there, left[part] = march(
-            replace(mesh, edges=mesh.edges[first : first + count + 1]),
-            A if len(A.entries) == 1 else A._replace(entries=A.entries[some]),
-            forcing, kicks[part], start, _ROUGH,
+            *_part(mesh, A, first, first + count), forcing, kicks[part], start, _ROUGH
         )
         ends[part] = found_there[:, -1]
         start = (ends[part] + kicks[part])[-1]
