@@ -42,7 +42,7 @@ class Entries(NamedTuple):
 
     def of(self, name: str) -> dict[tuple[int, ...], Array]:
         """Coefficients (orders, N or 1) by the place of an entry."""
-        values = np.moveaxis(getattr(self.values, name), 2, 0)[self.which(name)]
+        values = getattr(self.values, name).transpose(2, 0, 1)[self.which(name)]
         places = [place.tolist() for place in self.places[name]]
         return dict(zip(zip(*places, strict=True), values, strict=True))
 

@@ -224,7 +224,7 @@ def _powers(degrees: Array, parts: IntArray | None = None) -> Array:
 
 def _largest_shares(values: Array, size: Array) -> Array:
     """Largest sizes (K, g) of values (K, g, w) in units of a size (w,)."""
-    of_powers = np.moveaxis(values, 1, 0)
+    of_powers = values.swapaxes(0, 1)
     return np.stack([np.abs(one / size).max(axis=1, initial=0.0) for one in of_powers], axis=1)
 
 

@@ -88,12 +88,12 @@ class Explicit:
     def states_from(self, z: Array) -> Array:
         """x (N, n, c) from x_I (N, d, c)."""
         x = np.zeros((len(self.state_units), len(z), z.shape[2]))
-        x[self.states] = np.moveaxis(z, 1, 0)
+        x[self.states] = z.swapaxes(0, 1)
         for i, row, known in self.others:
             x[i] -= known[:, None]
             for k, a in row.items():
                 x[i] -= a[:, None] * x[k]
-        return np.moveaxis(x, 0, 1)
+        return x.swapaxes(0, 1)
 
     def sizes_from(self, size: Array) -> Array:
         """What states (n, c) are made of at most, from sizes of x_I (d, c)."""
@@ -152,7 +152,7 @@ class _Equations:
         """Row i, to be changed."""
         if i not in self.rows:
             part = slice(self.first[i], self.first[i + 1])
-            values = list(np.moveaxis(self.found.jets(self.name, self.order[part]), 2, 0).copy())
+            values = list(self.found.jets(self.name, self.order[part]).transpose(2, 0, 1).copy())
             if self.divided[i] >= 0:
                 values = [product(v, self._factor(i)) for v in values]
             self.rows[i] = dict(zip(self.place[1][part].tolist(), values, strict=True))
