@@ -535,6 +535,14 @@ def test_under_noise_the_time_to_settle_stands_for_that_to_one_percent(
         np.testing.assert_array_equal(curve.y, [4.0, 3.0, np.nan])
 
 
+def test_there_is_no_panel_of_times_that_never_come() -> None:
+    result = make_result((1e10, 1e8, 1e6), samples=11)
+    assert result.metrics is not None
+    never = {f"seconds_to_1pct_{of}": np.full(3, np.inf) for of in ("parameters", "states")}
+    result = replace(result, metrics=replace(result.metrics, **never))
+    assert [panel.name for panel in describe(result, ["gains"])["gains"]] == ["final error"]
+
+
 @pytest.mark.parametrize(("gammas", "bands"), [((1e10,), 1), ((1e10, 1e8), 0)])
 def test_deviations_are_drawn_about_a_single_case(gammas: tuple[float, ...], bands: int) -> None:
     result = make_result(gammas, samples=11)

@@ -206,7 +206,8 @@ def delta(result: RunResult, estimation: EstimationResult) -> list[Panel]:
 def gains(result: RunResult) -> list[Panel]:
     """Final errors and times over the one gain that varies, if at least three do.
 
-    Times are those to 1 %, and under noise those from which on all is within ±2σ of the end.
+    Times are those to 1 %, and under noise those from which on all is within ±2σ of the end, if
+    there are such times.
     """
     estimation, metrics = result.estimation, result.metrics
     gain = _varying_gain(estimation) if estimation is not None else None
@@ -226,18 +227,17 @@ def gains(result: RunResult) -> list[Panel]:
         of = ("parameters", "states")
         return tuple(curve(f"{kind}_{each}", each, k) for k, each in enumerate(of))
 
-    times = [Panel("time to 1 %", over_gain("seconds_to_1pct"), "s", axis=axis)]
+    times = Panel("time to 1 %", over_gain("seconds_to_1pct"), "s", axis=axis)
     if metrics.seconds_to_settled is not None:
-        settled = curve(SETTLED, "all", 2)
-        known = bool(np.isfinite(settled.y).any())
-        times = [Panel("time to ±2σ", (settled,), "s", axis=axis)] if known else []
+        times = Panel("time to ±2σ", (curve(SETTLED, "all", 2),), "s", axis=axis)
+    ever = any(np.isfinite(each.y).any() for each in times.curves)
     truth, seen = estimation.true_parameters, _seen(estimation, _known(result))
     of_eta = truth[:, ~np.isnan(truth).any(axis=0)]
     size = max(largest(of_eta), largest(result.signals.states[:, seen]))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
     return _with_legend([
         Panel("final error", over_gain("final_error"), log=True, size=size, axis=axis),
-        *times,
+        *([times] if ever else []),
     ])
 
 
