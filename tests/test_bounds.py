@@ -314,6 +314,19 @@ def test_a_narrow_pulse_along_an_output_is_seen(width):
     assert "nothing bounds" not in found.verdict
 
 
+def test_a_pulse_along_an_output_that_another_pulse_moves_is_seen():
+    """The first one takes √π/10 from an output, which the second one follows 1.8 s later then."""
+    at = {"y": 0.2134, "z": 0.3071}
+    first, second = (f"1e3*exp(-(({y} - {place})/1e-4)**2)" for y, place in at.items())
+    found = run({
+        "name": "slits", "states": ["c", "p", "q"], "inputs": {"u": 0.1}, "outputs": [*at],
+        "E": np.eye(3).tolist(), "A": [[0, 0, 0], [0, 0, 0], [0, 0, f"-{second}"]],
+        "B": [[1], [f"1 - {first}"], [0]], "C": [[1, 0, 0], [0, 1, 0]], "initial_state": [0, 0, 1],
+    }, observer="none", time={"horizon": 10}, solver={"tol": 1e-9})
+    assert found["p"][-1] == pytest.approx(1 - 0.1 * np.sqrt(np.pi), rel=1e-6)
+    assert found["q"][-1] == pytest.approx(np.exp(-np.sqrt(np.pi)), rel=1e-6)
+
+
 @pytest.mark.parametrize("least", [
     {"model.expressions.bounds._MOST_ALONG": 2, "model.expressions.bounds._FOR_EACH": 0},
     {"simulation.simulate._LOOKS": 1},

@@ -289,6 +289,9 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
     assert np.abs(found.memory.values / exact - 1.0).max() < 1e-6
     with pytest.raises(SolverError, match=r"estimator\.beta = 1e\+15 .*; lower it"):
         information(constant, 1.0, f0, 1e15, bound)
+    large = regression(lambda t: np.broadcast_to(1e3 * row, (*np.shape(t), 2)), ETA[:2])
+    with pytest.raises(SolverError, match=r"does not settle near t = .*; lower estimator\.beta"):
+        information(large, 1.0, f0, 10.0, bound)  # of 1e6 by 1e-6 rounding leaves nothing
 
 
 def test_what_is_mixed_keeps_the_digits_of_small_columns():

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from plants import observed, reference, shipped
 from regressions import ETA, fading, regression, three
@@ -94,7 +94,9 @@ def test_a_window_of_samples_of_a_circle(hold):
     np.testing.assert_allclose(level[t > -1.0 + w - 1e-6], 0.5 * (w - np.sin(w)), rtol=1e-3)
 
 
-def test_t_c_is_the_first_time_the_level_is_reached():
+@pytest.mark.parametrize("window", [4096, 3])  # elements that are looked at together
+def test_t_c_is_the_first_time_the_level_is_reached(window, monkeypatch):
+    monkeypatch.setattr("gpebo_cli.regression.linear._WINDOW", window)
     found = assess(CLEAN, T, ExcitationSettings(rho=0.5))
     assert np.linalg.eigvalsh(gram(three, 0, found.t_c))[0] == pytest.approx(0.5, rel=1e-6)
     never = assess(CLEAN, T, ExcitationSettings(rho=1e6))
@@ -128,6 +130,7 @@ def test_t_c_is_no_rounding_of_what_g_grows_to(bend, horizon):
     power=st.integers(1, 3), rate=st.floats(0.5, 2.0), bend=st.floats(0.02, 0.5),
     elements=st.integers(4, 12),
 )
+@example(power=3, rate=1.0, bend=0.5, elements=4)
 def test_t_c_does_not_depend_on_the_elements(power, rate, bend, elements):
     """ψ = tⁿ e^(−rate t) (1, 1 + bend t²): early in an element it is nothing beside its end."""
     def found(elements):
