@@ -84,7 +84,7 @@ def sampled_orders(path: Path) -> None:
     time = TimeSettings(0.0, HORIZON, 20_001)
 
     def estimates(observer: dict[str, object]) -> tuple[Array, Array]:
-        settings = Settings({"name": "ls_drem"}, time=time, observer=observer)
+        settings = Settings({"name": "ls_drem", "gamma": 10}, time=time, observer=observer)
         estimation = run_experiment(settings, plant).estimation
         assert estimation is not None  # noqa: S101  an observer was asked for
         return estimation.t, estimation.states[0]

@@ -98,7 +98,7 @@ class NoiseSettings:
 class ExcitationSettings:
     """Level and window of the excitation evidence."""
 
-    # Level asked of lambda_min(G); None: 1e-8 of the regressor's own size.
+    # Level asked of lambda_min(G); None: none, the verdict knows no unit.
     rho: float | None = positive(None)
     window: float | None = positive(None)  # of the PE level, in seconds; None: horizon / 10
 

@@ -767,6 +767,8 @@ def test_command_warns_on_stderr_and_in_the_summary(tmp_path):
     assert line.startswith("gpebo: warning: Φ has grown to ")
     warning = line.removeprefix("gpebo: warning: ")
     assert warning in done.stdout.splitlines()[-1]
+    page = Path(__file__).parents[1] / "docs" / "howto" / "unstable.md"
+    assert warning in " ".join(page.read_text(encoding="utf-8").split())
     summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
     assert summary["warnings"] == [warning]
     done = gpebo(*words, "observer.remedy=reset", cwd=tmp_path)
