@@ -741,6 +741,18 @@ def test_estimators_that_cannot_follow_are_refused(name):
         run(UNBOUNDED, 5.0, estimator={"name": name}, remedy="current_coordinates")
 
 
+@pytest.mark.parametrize("name", ["drem", "ls_drem", "power"])
+def test_between_two_resets_there_may_be_no_output_time(name):
+    """Δ at 0 and 1 s is that of a run with more output times; both resets are between these."""
+    few, many = (
+        api_run(
+            "descriptor", estimator=name, time={"horizon": 2, "samples": samples},
+            observer={"remedy": "reset", "reset_times": [1.2, 1.4]},
+        ).details.estimation.delta for samples in (3, 21)
+    )
+    assert few[0] == pytest.approx(many[0, ::10], rel=1e-9, abs=1e-300)
+
+
 @pytest.mark.parametrize("name", ["least_squares", "ls_drem", "drem", "mre"])
 def test_a_reset_that_keeps_nothing_follows_a_step_of_an_unknown(name):
     """θ steps at 10; learnt anew from there on it is exact, and without that it is not."""

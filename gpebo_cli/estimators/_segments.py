@@ -192,7 +192,8 @@ class Chain:
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,); it jumps where the parameters do."""
         cuts = np.searchsorted(t, [reset.time for reset in self.resets], side="left")
-        pieces = [part.delta(own) for part, own in zip(self.parts, np.split(t, cuts), strict=True)]
+        pairs = zip(self.parts, np.split(t, cuts), strict=True)
+        pieces = [part.delta(own) for part, own in pairs if len(own)]
         found = [piece for piece in pieces if piece is not None]
         return np.concatenate(found, axis=1) if found else None
 
