@@ -19,6 +19,7 @@ from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import (
     Filtered,
     StateSpace,
+    _renewed,
     filter_windows,
     pair,
     quotient,
@@ -405,3 +406,38 @@ def test_a_chain_of_many_states_needs_few_elements():
     np.testing.assert_allclose(estimate[..., 0], estimates, atol=1e-8)
     assert found.error_estimate < 1e-8
     assert found.mesh.size < 150
+
+
+def test_a_filter_that_forgets_fast_is_cut_for_it_at_once():
+    """Nearly exact measurements and process noise: rates of 3,000/s, of which P shows nothing."""
+    A, c = np.array([[-0.2, 1.0], [-1.0, -0.2]]), np.array([[0.0, 1.0]])
+    V, asked = np.array([[1e-8]]), []
+
+    def model(t, inside):
+        asked.append(len(t))
+        b, z = np.sin(t)[:, None, None] * np.ones((2, 1)), np.cos(t)[:, None, None]
+        return StateSpace(
+            A[None], b, c[None], z, 0.1 * np.eye(2)[None], np.zeros((1, 2, 1)), V[None]
+        ), ()
+
+    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(14))
+    found = run_filter(model, np.zeros((2, 1)), np.eye(2), mesh, tol=1e-9, max_elements=20_000)
+    expected, steps = np.eye(2), 10_000
+    over = expm(np.block([[-A.T, c.T @ c / V], [0.1 * np.eye(2), A]]) * 2.0 / steps)
+    for _ in range(steps):
+        X1, X2 = np.split(over @ np.concatenate([np.eye(2), expected]), 2)
+        expected = X2 @ np.linalg.inv(X1)
+    P, _ = found.at(np.array([2.0]))
+    d = np.sqrt(np.diag(expected))
+    assert np.abs((P[0] - expected) / np.outer(d, d)).max() < found.error_estimate < 1e-4
+    assert sum(asked) < 110_000  # times, of all meshes that it went through
+
+
+@pytest.mark.parametrize("n", [1, 4])
+def test_what_starts_anew_at_edges_is_pair_and_quotient(n):
+    X = np.random.default_rng(n).normal(size=(2 * n, n + 2))
+    expected = pair(*quotient(X))
+    np.testing.assert_allclose(_renewed(X), expected, atol=1e-12 * np.abs(expected).max())
+    X[:, 0] = 0.0
+    with pytest.raises(np.linalg.LinAlgError):
+        _renewed(X)

@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg.lapack import dgetrf, dgetrs
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.arrays import joined
@@ -47,8 +48,10 @@ _FALL = 1e12  # of P over the horizon: beyond, a double does not hold both ends
 _UNSEEN = 1e-12  # of P, by which measurements change it over the horizon: as much as none
 _LEFT = 3e-3  # of the rounding of P(0): it falls as well, if less
 _STAGES = 8  # at least, at first: P falls fast from where it starts, whatever a mesh was made for
-_MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages that they need
+_MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages that they need,
+_SLOW = 0.3  # if the logarithm of X₁ grows by no more in any of them
 _ROOM = 8  # times as many elements may be needed with few stages
+_SETTLED = 1e2  # the same at first, where P has settled: elements are to resolve it, too
 _GROWTH = 1e3  # of X₁ within an element, at most: as many digits of P are lost
 
 
@@ -98,6 +101,17 @@ def pair(P: Array, estimate: Array) -> Array:
     out[:n, :n].flat[:: n + 1] = 1.0
     out[n:, :n], out[n:, n:] = P, estimate
     return out
+
+
+def _renewed(X: Array) -> Array:
+    """``pair(*quotient(X))`` of one pair, in less than half the time: there are many edges."""
+    n = len(X) // 2
+    factors, pivots, singular = dgetrf(X[:n, :n])
+    if singular:
+        raise np.linalg.LinAlgError
+    P = dgetrs(factors, pivots, X[n:, :n].T, trans=1)[0]
+    reached = dgetrs(factors, pivots, X[:n, n:])[0]
+    return pair(0.5 * (P + P.T), X[n:, n:] - X[n:, :n] @ reached)
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,20 +211,11 @@ def run_filter(
             (growth, 0.0), (own.reshape(*own.shape[:2], -1), 0.0), *followed(estimate, extras)
         ]
 
-    problem = LinearProblem(
-        coefficients, first, signals, name,
-        renewal=lambda reached: pair(*quotient(reached)),
-    )
+    problem = LinearProblem(coefficients, first, signals, name, renewal=_renewed)
     try:
-        # P may fall in less than times far from zero are told apart.
-        stages, begin = max(mesh.rule.stages, 0 if before else _STAGES), mesh.edges[0]
-        if _MANY < mesh.size < max_elements / _ROOM:
-            stages = min(stages, _FEW)
-        # P falls as 1/t: what is not resolved first spoils all that follows.
-        edges, halves = mesh.edges - begin, int(np.log2(max(fastest * mesh.steps[0], 1.0)))
-        edges = np.insert(edges, 1, edges[1] * np.exp2(np.arange(-halves, 0)))
-        mesh = Mesh(edges, radau_rule(stages), mesh.origin + begin)
-        solution = solve(problem, mesh, tol=tol, max_elements=max_elements)
+        H = coefficients(mesh.points[:, 1], mesh.inside[:, 1]).A
+        first_mesh = _first_mesh(mesh, H, 0 if before else _STAGES, fastest, max_elements)
+        solution = solve(problem, first_mesh, tol=tol, max_elements=max_elements)
         P, estimate = quotient(solution.trajectory.values)
         error_estimate = _error(problem, solution.trajectory, followed)
     except np.linalg.LinAlgError as error:
@@ -235,6 +240,27 @@ def run_filter(
         tuple(Trajectory(mesh, extra) for extra in solution.extras), tol,
         tuple(map(np.maximum, largest, before.sizes) if before else largest),
     )
+
+
+def _first_mesh(mesh: Mesh, H: Array, least: int, fastest: float, max_elements: int) -> Mesh:
+    """A mesh that may resolve P, of ``least`` stages or more, from H (K or 1, 2n, 2n) by element.
+
+    At first P falls as fast as ``fastest``, in 1/s. How fast X₁ grows where P has settled is known
+    beforehand, too: cuts by one round after the other would go through many meshes.
+    """
+    growth = mesh.steps * np.linalg.eigvals(H).real.max(axis=1)
+    stages = max(mesh.rule.stages, least)
+    if _MANY < mesh.size < max_elements / _ROOM and growth.max() < _SLOW:
+        stages = min(stages, _FEW)
+    parts = np.ceil(growth / np.log(_SETTLED)).clip(1.0)
+    if parts.sum() <= max_elements:
+        mesh, _ = mesh.split(parts.astype(np.intp))
+    # P falls as 1/t: what is not resolved first spoils all that follows. It may fall in less than
+    # times far from zero are told apart.
+    begin = mesh.edges[0]
+    edges, halves = mesh.edges - begin, int(np.log2(max(fastest * mesh.steps[0], 1.0)))
+    edges = np.insert(edges, 1, edges[1] * np.exp2(np.arange(-halves, 0)))
+    return Mesh(edges, radau_rule(stages), mesh.origin + begin)
 
 
 def _scaled(
