@@ -796,6 +796,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "dream"}, "'dream' is not an estimator"),
         ({"name": ["drem"]}, r"\['drem'\].* is not an estimator"),
         ({"name": "drem", "gamma": -1}, "positive number"),
+        ({"name": "instrumental", "delay": 0.0}, "delay: expected a positive number, got 0"),
         ({"name": "drem", "gamma": []}, "empty list"),
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
         ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, r"\(0, 301, 5\) needs .* ±300"),
