@@ -1080,6 +1080,19 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
         assert ", parameters well determined at the end; |Y − ψη̂| with the final" in said
 
 
+def test_a_power_law_that_no_step_resolves_ends_in_one_line():
+    made, rng = estimate("power", CLEAN, gamma=1e9), np.random.default_rng(0)
+    (path,) = made.groups
+    rough = replace(
+        path, mixed=np.ones_like(path.mixed), quotient=rng.standard_normal(path.quotient.shape),
+        signals=lambda t, inside: (
+            rng.standard_normal(len(t)), rng.standard_normal((len(t), 3)), np.ones(len(t)),
+        ),
+    )
+    with pytest.raises(SolverError, match="the power law is not resolved near t = 0"):
+        made.law(rough, ETA + 1.0, np.array([[1e9]]))
+
+
 @pytest.mark.parametrize("gain", [1e10, 1e24, 1e30])
 def test_a_gain_that_makes_up_for_rounding_does_not_break_the_scalar_law(gain):
     """Δ and η̄ jump from point to point by rounding: no element is short enough for that."""
