@@ -243,6 +243,17 @@ def test_what_is_zero_for_a_while_switches_nothing_then(text, whole):
     assert integrated(text, horizon=5 * np.pi) == pytest.approx(whole, rel=1e-12)
 
 
+@pytest.mark.parametrize("start", [1e6, -1e6])
+def test_the_rounding_of_an_instant_far_from_zero_is_in_the_estimate(start):
+    plant = plant_from_mapping({
+        "name": "p", "states": ["x"], "inputs": {"u": f"sign(t - ({start} + 3.3))"}, "E": [[1]],
+        "A": [[0]], "B": [[1]], "initial_state": [0],
+    })
+    result = simulate(plant, TimeSettings(start=start, horizon=10.0), SolverSettings())
+    error = abs(result.signals.states.final[0] - 3.4) / 3.4
+    assert 1e-12 < error < result.error_estimate < 1e-9
+
+
 def test_falling_arguments_switch_the_right_way():
     assert integrated("step(-(t - 5))") == pytest.approx(5.0, rel=1e-12)
     assert integrated("abs(-(t - 3))", horizon=5.0) == pytest.approx(6.5, rel=1e-12)

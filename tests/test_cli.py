@@ -122,6 +122,13 @@ def test_every_file_of_a_group_has_a_title():
             assert yaml.safe_load(path.read_text())["title"], path
 
 
+def test_a_folder_may_be_named_by_what_hydra_knows(tmp_path):
+    for plant in ("circuit", "descriptor"):  # of this run, not of the one before
+        words = f"plant={plant}", "observer=none", "hydra.run.dir=${hydra:runtime.choices.plant}"
+        printed(gpebo("run", *words, *FAST, cwd=tmp_path))
+        assert (tmp_path / plant / "summary.json").exists()
+
+
 def test_a_title_or_a_result_cannot_command_the_terminal(tmp_path, mine):
     (mine / "plant" / "evil.yaml").write_text("title: a\x1b[31mb\n")
     assert r"a\x1b[31mb" in printed(gpebo("list", "plants", "--config-dir", mine, cwd=tmp_path))

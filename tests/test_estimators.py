@@ -796,6 +796,7 @@ def test_a_gain_per_parameter_by_name():
         ({"name": "dream"}, "'dream' is not an estimator"),
         ({"name": ["drem"]}, r"\['drem'\].* is not an estimator"),
         ({"name": "drem", "gamma": -1}, "positive number"),
+        ({"name": "instrumental", "delay": 0.0}, "delay: expected a positive number, got 0"),
         ({"name": "drem", "gamma": []}, "empty list"),
         ({"name": "gradient", "gamma": "auto"}, "'auto' is not a positive number"),
         ({"name": "drem", "gamma": "logspace(0, 301, 5)"}, r"\(0, 301, 5\) needs .* ±300"),
@@ -1077,6 +1078,19 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
         assert known.t_c == pytest.approx(whole.t_c, abs=2.0 * signals.t[1])
         assert known.level == pytest.approx(whole.level, rel=1e-3)
         assert ", parameters well determined at the end; |Y − ψη̂| with the final" in said
+
+
+def test_a_power_law_that_no_step_resolves_ends_in_one_line():
+    made, rng = estimate("power", CLEAN, gamma=1e9), np.random.default_rng(0)
+    (path,) = made.groups
+    rough = replace(
+        path, mixed=np.ones_like(path.mixed), quotient=rng.standard_normal(path.quotient.shape),
+        signals=lambda t, inside: (
+            rng.standard_normal(len(t)), rng.standard_normal((len(t), 3)), np.ones(len(t)),
+        ),
+    )
+    with pytest.raises(SolverError, match="the power law is not resolved near t = 0"):
+        made.law(rough, ETA + 1.0, np.array([[1e9]]))
 
 
 @pytest.mark.parametrize("gain", [1e10, 1e24, 1e30])

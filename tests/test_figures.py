@@ -232,12 +232,13 @@ def test_time_axis_of_other_scales() -> None:
 def test_a_band_has_both_its_edges_in_the_figure_and_in_the_table() -> None:
     t, edge = np.arange(3.0), np.full(3, 0.5)
     band = style.Curve(t, edge, "band", replace(style.line(0), dots=True), down_to=-edge)
-    panel = style.Panel("y", (band,))
+    panel = style.Panel("y", (band,), vertical=(1.5, "t_c"))
     axes = style.compose([panel]).axes[0]
     assert [line.get_ydata()[0] for line in axes.lines[:2]] == [0.5, -0.5]
     low, high = axes.get_xlim()
     assert (low < t[0], high > t[-1]) == (True, True), "whole dots at either end"
-    [[_, *columns]] = blocks([panel])
+    [_, *columns], [vertical] = blocks([panel])
+    assert (vertical.name, *vertical.values) == ("t_c", 1.5)
     assert [c.values[0] for c in columns] == [0.5, -0.5]
     assert [c.name for c in columns] == ["y: band", "y: band, lower edge"]
 

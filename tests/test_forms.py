@@ -393,6 +393,21 @@ def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differen
         strangeness_free(given, t, t, signals, max_mu=3, rank_tol=1e-10)
 
 
+@pytest.mark.parametrize("place", [0.1, 1.9])
+def test_ranks_are_looked_at_over_all_of_the_horizon(place):
+    """Beside either end, too, though the times at which equations are asked for are few."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "z"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [1, f"t - {place}"]], "C": [[1, 0]], "initial_state": [1, 1],
+    })
+    t = np.array([0.0, 1.0, 2.0])
+    inputs = InputDerivatives.of_plant(system, np.ones(0, dtype=bool))
+    with pytest.raises(ModelError, match="differential part changes at t = "):
+        strangeness_free(
+            EquationForm.given(system, inputs, t), t, t, None, max_mu=3, rank_tol=1e-10
+        )
+
+
 def test_an_algebraic_state_in_no_row_but_its_outputs_needs_the_form_as_given():
     """Titration: what is measured follows from a nonlinear row, in which only its output stands."""
     plant = {

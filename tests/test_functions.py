@@ -149,6 +149,7 @@ def test_entries_that_come_later_and_outputs_that_are_not_known_are_named():
     fed = system_from_functions("two", A=lambda t, u, y: np.zeros((len(t), 2, 2)), **two)
     with pytest.raises(ConfigError, match="plant two: A depends on the outputs, which are not kn"):
         fed.coefficients.taylor(np.ones(1), 0)
+    assert not fed.coefficients.of_time.taylor(np.ones(1), 0).A.any()
     with pytest.raises(TypeError, match="a mistake of one's own"):
         system_from_functions("two", A=wrong, **two).coefficients.taylor(np.ones(1), 0)
     rows = [lambda t: np.ones((len(t), 3, 2)), lambda t: np.zeros((len(t), 3, 2))]

@@ -611,6 +611,8 @@ def test_entries_of_a_mechanism_may_be_numbers_and_text_of_either_sign():
     np.testing.assert_allclose(found.E[0, 0], np.block([[one, none], [none, np.diag([2.0, 3.0])]]))
     np.testing.assert_allclose(found.A[0, 0], np.block([[none, one], [-K, -D]]))
     np.testing.assert_allclose(found.B[0, 0].ravel(), [0.0, 0.0, 2.0, -2.0])
+    alone = plant_from_mapping(from_mechanics({"M": [[2]], "measure": ["q1"]}, "m").mapping())
+    np.testing.assert_array_equal(alone.coefficients.taylor(np.zeros(1), 0).A[0, 0], np.eye(2, k=1))
 
 
 def test_a_slider_crank_about_its_motion_is_observed_from_one_position():

@@ -193,6 +193,7 @@ def test_states_deviations_hold_the_errors_and_the_direct_noise():
 def test_what_regularises_an_exact_measurement_is_reported():
     quiet = run(shipped("circuit"), noise=NoiseSettings(outputs=0.02, sample_time=0.1))
     found = assumption(quiet, "Measurement noise")
+    assert found.holds
     assert found.evidence["regularised_with"] == (
         "noise of 0.001 of each equation's own under P0 at 0.1 s")
     assert found.evidence["intensity_y"] == pytest.approx(0.02**2 * 0.1)

@@ -19,6 +19,8 @@ from PIL import Image
 from processes import read_table
 
 from gpebo_cli.cli import app, figures
+from gpebo_cli.cli import arguments as command_line
+from gpebo_cli.cli.composition import session
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -430,6 +432,23 @@ def test_the_tables_hold_for_another_method(monkeypatch: pytest.MonkeyPatch) -> 
     for recipe in figures.run_recipes(["paper_circuit"]):
         panels = gallery.figures_of(recipe)
         assert list(gallery.check_references(TABLES, recipe.name, panels)) == []
+
+
+@pytest.mark.parametrize(("section", "labels"), [
+    ("{}", [""]), ("{mode: MULTIRUN}", [""]),
+    ("{sweeper: {params: {time.horizon: '1,2'}}}", [""]),  # one run, as `gpebo run` makes it
+    ("{mode: MULTIRUN, sweeper: {params: {time.horizon: '1,2'}}}", ["1", "2"]),
+    ("{mode: MULTIRUN, sweeper: {params: {plant: 'published/akzo,circuit'}}}", ["akzo", "circuit"]),
+])
+def test_a_recipe_is_a_sweep_where_it_says_so(
+    tmp_path: Path, section: str, labels: list[str]
+) -> None:
+    (tmp_path / "experiment").mkdir()
+    text = f"# @package _global_\ntitle: x\nhydra: {section}\n"
+    (tmp_path / "experiment" / "x.yaml").write_text(text)
+    with session(command_line.parse(["--config-dir", str(tmp_path)])) as hydra:
+        jobs = list(figures.recipe_jobs("x", hydra.config_loader))
+    assert [label for label, _ in jobs] == labels
 
 
 def test_the_tables_are_small() -> None:

@@ -369,8 +369,9 @@ def test_what_is_remembered_does_not_grow():
 def test_least_squares_at_samples_is_a_batch_solution(hold):
     block = regression(hold=hold)
     f0, alpha, beta = 0.3, 2.0, 0.4
-    settings = {"name": "least_squares", "f0": f0, "alpha": alpha, "beta": beta, "initial": 0.7}
-    recursion = estimators.build(settings).recursive(["a", "b", "c"])
+    settings = {"name": "least_squares", "f0": f0, "beta": beta, "initial": 0.7}
+    both = [alpha, 3.0 * alpha]  # the weaker one has to be enough
+    recursion = estimators.build({**settings, "alpha": both}).recursive(["a", "b", "c"])
     made = recursion.update(block)
     estimate = made.parameters[0, -1]
     assert recursion.requirement.holds

@@ -108,8 +108,7 @@ def parse(words: list[str], command: str = "run", more: Sequence[str] = ()) -> A
             )
     given = options.parse(command, words, _WITH_VALUE, (*_SWITCHES, *more))
     _check_questions(given)
-    sweep = {key: text for key, _, text in (word.partition("=") for word in given.words)
-             if key in _SWEEP_WORDS}
+    sweep = {key: text for key, _, text in (word.partition("=") for word in given.words)}
     overrides = [_stored(w) for w in given.words if w.partition("=")[0] not in _SWEEP_WORDS]
     config_dir, fail_fast = given.config_dir, sweep.get("fail_fast")
     config_name = _config_name(given.values.get("--config-name"), config_dir)

@@ -133,10 +133,10 @@ def recipe_jobs(name: str, loader: ConfigLoader) -> Iterator[tuple[str, DictConf
 
     overrides = [f"experiment={name}"]
     first = loader.load_configuration(PRIMARY, overrides, RunMode.RUN)
-    swept: Mapping[str, Any] = first.hydra.sweeper.get("params") or {}
-    if first.hydra.mode != RunMode.MULTIRUN or not swept:
+    if first.hydra.mode != RunMode.MULTIRUN:
         yield "", first
         return
+    swept: Mapping[str, Any] = first.hydra.sweeper.get("params") or {}
     stored = OverridesParser.create().parse_overrides([f"{k}={v}" for k, v in swept.items()])
     (jobs,) = BasicSweeper.split_arguments(stored, None)
     values = [[word.partition("=")[2] for word in words] for words in jobs]

@@ -458,8 +458,6 @@ def follow_dips(
     probe may by luck be nearer to the zero than the times of the first round.
     """
     steady, dips = _dips(smallest)
-    if not dips:
-        return steady
     column, k = np.array(dips, dtype=np.intp).reshape(-1, 2).T
     left, right = t[np.maximum(k - 1, 0)], t[np.minimum(k + 1, len(t) - 1)]
     lowest, zero = smallest[k, column], np.maximum(rank_tol, 1e-9 * smallest.max(axis=0))
