@@ -12,7 +12,9 @@ from omegaconf.errors import OmegaConfBaseException
 from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.configs.files import is_group
 from gpebo_cli.configs.locations import GROUPS, choices, conf_folder
+from gpebo_cli.model.plant import KEYS as OF_PLANTS
 from gpebo_cli.registry import installed
+from gpebo_cli.regression.text import KEYS as OF_REGRESSIONS
 from gpebo_cli.schema import nearest, shown
 
 LIBRARY_ERRORS = (HydraException, OmegaConfBaseException)
@@ -130,6 +132,8 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         and missing in child
     ]
     hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
+    if path == "plant" and missing in (*OF_PLANTS, *OF_REGRESSIONS):
+        hint = f"; '+{full}=VALUE' adds it"
     if path in GROUPS and parent.get("name") == "none":
         others = [name for name in choices(conf_folder(), path) if name != "none"]
         hint = f"; choose {' or '.join(f'{path}={name}' for name in others)} first"
