@@ -39,7 +39,7 @@ def test_it_can_be_written_elsewhere(tmp_path):
 
 def test_an_observer_passes_its_test(tmp_path):
     printed(gpebo("new", "observer", "mine_too", cwd=tmp_path))
-    assert "3 passed" in shell(PYTEST, tmp_path)
+    assert "5 passed" in shell(PYTEST, tmp_path)
     entry = tomllib.loads((tmp_path / "pyproject.toml").read_text())["project"]["entry-points"]
     assert entry == {"gpebo.observers": {"mine_too": "mine_too:MineToo"}}
 

@@ -44,5 +44,6 @@ def test_an_observer_of_another_package(tmp_path):
     error = re.search(r"state error (\S+) at the end", printed(command()))
     assert error is not None
     assert float(error[1]) < 1e-9
+    assert_refused(command("+plant.phi=[t,0]"), "this observer takes E = I, no φ, D or H")
     said = "observer.gain: no such key; observer has xi_a0"
     assert_refused(command("+observer.gain=1"), said)

@@ -143,7 +143,8 @@ def _check_questions(given: Options) -> None:
 
 
 def _stored(word: str) -> str:
-    """``figures.dpi=300`` where it is stored: ``figures`` itself is a list of names."""
+    """``figures.dpi=300``, ``regression.S=…`` where it is stored: in ``output``, as a plant's."""
+    word = re.sub(r"^([+~]*)regression\.", r"\1plant.", word)
     match = re.match(r"\+*figures\.([^=]*)=", word)
     if match is None:
         return word

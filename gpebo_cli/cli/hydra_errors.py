@@ -25,6 +25,7 @@ _NO_MATCH = re.compile(r"^Could not override '([^']+)'\.\s+No match in the defau
 _MISSING_IN = re.compile(r"^In '([^']+)'")
 _EXTRAS = {"joblib": "parallel", "ray": "ray", "submitit_slurm": "slurm", "submitit_local": "slurm"}
 _LONGEST = 400
+_OF_NUMBERS = ("time", "solver", "excitation")  # sections without a list
 
 
 def explain(error: BaseException, arguments: Arguments) -> str:
@@ -36,10 +37,10 @@ def explain(error: BaseException, arguments: Arguments) -> str:
     text, cause = str(error), error.__cause__
     if match := _SEVERAL.search(text):
         key, _, values = match[1].partition("=")
-        return (
-            f"{match[1]}: several values; write '{key}=[{values}]' for a list (a case for each "
-            "gain in one run), or add -m for a run for each"
-        )
+        cases = " (a case for each gain in one run)" if key.startswith("estimator.") else ""
+        one = key in GROUPS or key.partition(".")[0] in _OF_NUMBERS
+        listed = "" if one else f"write '{key}=[{values}]' for a list{cases}, or "
+        return f"{match[1]}: several values; {listed}add -m for a run for each"
     if (match := _TWICE.search(text)) and match[1] in GROUPS:
         group = match[1]
         return f"{group} is chosen twice; write {group}=NAME once, without +"
@@ -104,6 +105,9 @@ def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
 
 def _unknown_key(key: str, cause: BaseException | None) -> str:
     """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
+    from gpebo_cli.model import plant
+    from gpebo_cli.regression import text
+
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
         return _one_line(f"{key}: {getattr(cause, 'msg', None) or 'it cannot be set'}")
@@ -130,6 +134,8 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         and missing in child
     ]
     hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
+    if path == "plant" and missing in (*plant.KEYS, *text.KEYS):
+        hint = f"; '+{full}=VALUE' adds it"
     if path in GROUPS and parent.get("name") == "none":
         others = [name for name in choices(conf_folder(), path) if name != "none"]
         hint = f"; choose {' or '.join(f'{path}={name}' for name in others)} first"

@@ -1,4 +1,4 @@
-"""An observer for plants with E = I: its dynamic extension is integrated in open loop.
+"""An observer for plants with E = I, without φ, D and H, in open loop.
 
 ξ_a' = A ξ_a + B u,  ξ_b' = A ξ_b + F,  Φ' = A Φ,  x = ξ_a + ξ_b θ − Φ e₀,
 Y = y − C ξ_a,  ψ = C [ξ_b, −Φ]
@@ -42,8 +42,8 @@ class Mine:
 
         def equation(t: Array, inside: Array) -> LinearEquation:
             c = system.coefficients.taylor(t, 0, inside)
-            if not (c.E[0] == np.eye(n)).all():
-                raise ConfigError(f"plant {system.name}: this observer takes plants with E = I")
+            if (c.E[0] != np.eye(n)).any() or any(part.any() for part in (c.phi, c.D, c.H)):
+                raise ConfigError(f"plant {system.name}: this observer takes E = I, no φ, D or H")
             f = np.zeros((len(t), n, 1 + q + n))
             f[:, :, :1] = c.B[0] @ signals.inputs(t, inside)[:, :, None]
             f[:, :, 1 : 1 + q] = c.F[0]

@@ -34,8 +34,9 @@ def test_it_finds_the_unknown_and_the_start() -> None:
     np.testing.assert_allclose(found, [0.7, -1.0, 1.0], atol=1e-6)
 
 
-def test_other_plants_are_refused() -> None:
-    system = load_plant({**PLANT, "E": [[1, 0], [0, 2]]})
+@pytest.mark.parametrize("other", [{"E": [[1, 0], [0, 2]]}, {"phi": ["t", 0]}, {"D": [[1]]}])
+def test_other_plants_are_refused(other: dict[str, object]) -> None:
+    system = load_plant({**PLANT, **other})
     signals = simulate(system, TimeSettings(), SolverSettings()).signals
     seen = Measurements(signals.inputs, signals.outputs)
     with pytest.raises(ConfigError, match="E = I"):
