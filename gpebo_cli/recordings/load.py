@@ -10,7 +10,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.model.text import FollowsSignals
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import SNAP, Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, recording_mesh
@@ -55,7 +55,8 @@ class Recording:
         never held but interpolated, since they are what estimates are compared with.
         """
         samples, m = self.table.samples, self.inputs.values.shape[2]
-        both = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)(t, t)
+        signal = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)
+        both = signal(t, t + SNAP * np.abs(t))
         return Samples(t, both[:, :m], both[:, m:], self.states(t))
 
 
