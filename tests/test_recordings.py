@@ -173,6 +173,14 @@ def test_a_sample_that_misses_its_row_by_rounding_has_that_row(first, step):
     assert found["z_hat"][0] == pytest.approx(u[3:], abs=1e-12)
 
 
+@pytest.mark.parametrize("horizon", [1e-9, 1e-6, 1e-5])
+def test_a_span_of_a_recording_may_be_too_short_beside_its_start(horizon):
+    t = 1.7e9 + np.arange(4.0)
+    data = {"frame": pd.DataFrame({"t": t, "V": np.sin(t), "y": np.cos(t)})}
+    with pytest.raises(ConfigError, match=r"s is too short to be resolved beside its start"):
+        run("circuit", data=data, time={"horizon": horizon})
+
+
 # The mesh ------------------------------------------------------------------------------------
 
 

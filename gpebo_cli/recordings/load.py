@@ -19,6 +19,7 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
+_SHORTEST = 1e-14  # of the largest time: elements of a shorter span are not told apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +119,13 @@ def _span(table: Table, time: TimeSettings) -> tuple[float, float]:
             f"{path}, line {table.lines[1]}, column t: the recording ends at t = {last:g}, before "
             f"time.start + time.horizon = {start:g} + {time.horizon:g}; {whole}"
         )
-    return max(start, first), min(stop, last)
+    start, stop = max(start, first), min(stop, last)
+    if not stop - start > _SHORTEST * max(abs(start), abs(stop)):
+        raise ConfigError(
+            f"{path}: a span of {stop - start:g} s is too short to be resolved beside its start, "
+            f"t = {start:.10g}"
+        )
+    return start, stop
 
 
 def _states(samples: Samples, span: tuple[float, float], *, smooth: bool) -> Trajectory:
