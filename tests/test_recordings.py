@@ -155,6 +155,32 @@ def test_the_span_may_be_a_part_of_the_recording(tmp_path):
     assert result.metrics.final_error_states[0] < 1e-4
 
 
+@pytest.mark.parametrize(("first", "step"), [(0.0, 0.01), (1e4, 0.01), (1.7e9, 0.1)])
+def test_a_sample_that_misses_its_row_by_rounding_has_that_row(first, step):
+    """z = u, which is held, from the fourth row to the last."""
+    plant = {
+        "name": "two", "states": ["x", "z"], "inputs": {"u": 0}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-0.5, 0], [0, -1]], "B": [[1], [1]], "C": [[1, 0]],
+        "initial_state": [0, 0],
+    }
+    t, u = np.round(first + step * np.arange(40), 6), np.sin(np.arange(40.0))
+    data = {"frame": pd.DataFrame({"t": t, "u": u, "y": u}), "hold": "zoh"}
+    found = run(
+        plant, data=data, observer={"sample_time": step}, estimator="least_squares",
+        time={"start": float(t[3])}, uncertainty=False,
+    )
+    assert found["u"].tolist() == u[3:].tolist()
+    assert found["z_hat"][0] == pytest.approx(u[3:], abs=1e-12)
+
+
+@pytest.mark.parametrize("horizon", [1e-9, 1e-6, 1e-5])
+def test_a_span_of_a_recording_may_be_too_short_beside_its_start(horizon):
+    t = 1.7e9 + np.arange(4.0)
+    data = {"frame": pd.DataFrame({"t": t, "V": np.sin(t), "y": np.cos(t)})}
+    with pytest.raises(ConfigError, match=r"s is too short to be resolved beside its start"):
+        run("circuit", data=data, time={"horizon": horizon})
+
+
 # The mesh ------------------------------------------------------------------------------------
 
 

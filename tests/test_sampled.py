@@ -916,3 +916,18 @@ def test_what_is_delayed_lies_between_samples_as_the_hold_has_it(hold, between):
     for t in np.arange(3.0, 50.0):  # what is kept is no longer than the delay and a step
         _, past = delayed(past, np.array([t]), np.array([[3.0 * t]]), 0.75, hold)
         assert past[0].tolist() == [t - 1.0, t]
+
+
+@pytest.mark.parametrize("name", ["instrumental", "annihilator"])
+def test_a_delay_is_the_same_number_of_samples_whenever_the_clock_began(name):
+    """Rows are 0.1 s apart, and 0.7 − 0.5 is less than 0.2 by a rounding."""
+    block = regression(K=60, steps=np.full(60, 0.1))
+    found = [
+        estimators.build({"name": name, "delay": 0.5, "gamma": 10.0})
+        .recursive(["a", "b", "c"])
+        .update(replace(block, t=np.round(start + 0.1 * np.arange(60), 6)))
+        .parameters
+        for start in (0.0, 3.7, 1e4)
+    ]
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], rtol=1e-6, atol=1e-9)

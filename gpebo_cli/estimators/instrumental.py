@@ -35,7 +35,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.linear import LinearRegression, with_realisations
 from gpebo_cli.regression.resets import ExtensionState, Known
-from gpebo_cli.regression.samples import Filter, Past, SampledRegression, delayed
+from gpebo_cli.regression.samples import Filter, Past, SampledRegression, ago, delayed
 
 
 def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) -> Array:
@@ -148,7 +148,7 @@ class SampledMeans:
         late, self._past = delayed(past, t, flat, delay, regression.hold)
         self._start = t[0] if self._start is None else self._start
         old, new = regression.shares
-        since = t - delay - self._start  # ψ(t − d) sets in within a step
+        since = ago(t, delay) - self._start  # ψ(t − d) sets in within a step
         of_late = np.where((since >= 0.0) & (since < regression.steps), since, new)
         old, new = old[:, None, None], np.repeat(np.stack([new, of_late], 1), p, axis=1)[..., None]
         before = np.zeros_like(late[:1]) if self._late is None else self._late

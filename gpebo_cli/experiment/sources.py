@@ -22,7 +22,7 @@ from gpebo_cli.experiment.verdict import (
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import SNAP, Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Sampling, build, sampling
 from gpebo_cli.recordings.hold import each_of, holds
@@ -190,7 +190,8 @@ def _grid(settings: Settings, samples: Sampling | None, start: float, stop: floa
 
 def sample_times(step: float, start: float, stop: float) -> Array:
     """start, start + T, … up to stop, (K,) (ConfigError)."""
-    count = int(np.floor((stop - start) / step * (1.0 + _ROUNDING)))
+    rounding = SNAP * max(abs(start), abs(stop))
+    count = int(np.floor(((stop - start) * (1.0 + _ROUNDING) + rounding) / step))
     if count < 1:
         raise ConfigError(
             f"observer.sample_time = {step:g} is longer than the horizon of {stop - start:g} s"
@@ -200,7 +201,7 @@ def sample_times(step: float, start: float, stop: float) -> Array:
             f"observer.sample_time = {step:g} makes {count} samples; at most {_MAX_SAMPLES} fit in "
             "one run"
         )
-    return np.asarray(start + step * np.arange(count + 1), dtype=np.float64)
+    return np.asarray(np.minimum(start + step * np.arange(count + 1), stop), dtype=np.float64)
 
 
 def _sample_simulation(

@@ -27,7 +27,8 @@ SHARE = 1e-3  # of the largest component: what is smaller is measured against th
 _FOOT = 1e-8  # of its final size: what a component was before may be that wrong
 _WIDE = 32  # columns, from which on BLAS's products are faster than the kernels
 _MANY = 1 << 16  # numbers, from which on sampling them by element pays
-_SNAP, _EXACT = 8.0 * np.finfo(float).eps, 4.0 * np.finfo(float).eps
+SNAP = 8.0 * float(np.finfo(float).eps)  # of a time: by how much it may miss a sample or an edge
+_EXACT = 4.0 * np.finfo(float).eps
 _BLUR = 8.0 * np.finfo(float).eps
 _EQUAL = 1e-11  # relative difference of lengths that is rounding,
 _ROUNDING = 8 * float(np.finfo(float).eps)  # if it is this of the span: short ones differ by more
@@ -156,7 +157,7 @@ class Mesh:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         asked, rule, t = t, self.rule, np.asarray(t, dtype=np.float64) - self.origin
-        belongs = t + _SNAP * np.abs(t) if inside is None else inside - self.origin
+        belongs = t + SNAP * np.abs(t) if inside is None else inside - self.origin
         found = Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))

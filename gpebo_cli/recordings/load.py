@@ -10,7 +10,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.model.text import FollowsSignals
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import SNAP, Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, recording_mesh
@@ -19,6 +19,7 @@ from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
+_SHORTEST = 1e-14  # of the largest time: elements of a shorter span are not told apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,8 @@ class Recording:
         never held but interpolated, since they are what estimates are compared with.
         """
         samples, m = self.table.samples, self.inputs.values.shape[2]
-        both = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)(t, t)
+        signal = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)
+        both = signal(t, t + SNAP * np.abs(t))
         return Samples(t, both[:, :m], both[:, m:], self.states(t))
 
 
@@ -117,7 +119,13 @@ def _span(table: Table, time: TimeSettings) -> tuple[float, float]:
             f"{path}, line {table.lines[1]}, column t: the recording ends at t = {last:g}, before "
             f"time.start + time.horizon = {start:g} + {time.horizon:g}; {whole}"
         )
-    return max(start, first), min(stop, last)
+    start, stop = max(start, first), min(stop, last)
+    if not stop - start > _SHORTEST * max(abs(start), abs(stop)):
+        raise ConfigError(
+            f"{path}: a span of {stop - start:g} s is too short to be resolved beside its start, "
+            f"t = {start:.10g}"
+        )
+    return start, stop
 
 
 def _states(samples: Samples, span: tuple[float, float], *, smooth: bool) -> Trajectory:

@@ -9,6 +9,7 @@ import numpy as np
 
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
+from gpebo_cli.numerics.mesh import SNAP
 from gpebo_cli.recordings.hold import held
 from gpebo_cli.regression.parametrisation import Parametrisation
 
@@ -67,14 +68,19 @@ def integrating(regression: SampledRegression, beta: float = 0.0) -> Filter:
     return Filter(decay, old * into[:-1], new * into[1:])
 
 
+def ago(t: Array, delay: float) -> Array:
+    """t − d (K,); what would miss a sample by rounding is not before it."""
+    return np.asarray(t - delay + SNAP * (np.abs(t) + delay))
+
+
 def delayed(past: Past, t: Array, x: Array, delay: float, hold: str) -> tuple[Array, Past]:
     """x(t − d) (K, c) as the hold has it, zero before the first sample of all, d in seconds.
 
     Samples (K, c) are at t (K,); the past is what the last call gave, at first the first one alone.
     """
-    new, at = t > past[0][-1], t - delay
+    new, at = t > past[0][-1], ago(t, delay)
     times, values = np.append(past[0], t[new]), np.append(past[1], x[new], axis=0)
     between = held(times, values, hold if len(times) > 1 else "zoh")
     kept = max(int(np.searchsorted(times, at[-1], side="right")) - 1, 0)
-    out = np.where((at >= times[0])[:, None], between(at, at), 0.0)
+    out = np.where((at >= times[0])[:, None], between(t - delay, at), 0.0)
     return out, (times[kept:], values[kept:])
