@@ -111,6 +111,16 @@ def test_a_name_that_is_not_there_is_a_key_error_with_the_nearest_one(circuit):
     assert len({name: circuit[name] for name in circuit}) == 1 + 1 + 1 + 6 + 9  # t, u, y, x, hats
 
 
+def test_what_is_done_to_the_plant_of_a_result_is_not_in_the_next_run():
+    words = {"observer": "none", "time": {"samples": 11, "horizon": 1.0}}
+    first = run("circuit", **words)
+    system = first.details.system
+    system.initial_state[:], system.units["e1"] = 9.0, "kV"
+    second = run("circuit", **words)
+    np.testing.assert_array_equal(second["e1"], first["e1"])
+    assert second.details.system.units["e1"] == "V"
+
+
 def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
     plant = {
         "name": "clash", "states": ["T", "e0_T"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
