@@ -243,7 +243,7 @@ def named_values(plant: str, key: str, value: object, example: str) -> dict[str,
 
 
 def kind_of_name(plant: str, kinds: Mapping[str, Collection[str]]) -> dict[str, str]:
-    """Which kind each name is; refuses those given twice, because columns are found by name."""
+    """Which kind each name is (ConfigError: one is given twice, and columns are found by name)."""
     seen: dict[str, str] = {}
     for kind, names in kinds.items():
         for name in names:
