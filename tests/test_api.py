@@ -111,6 +111,16 @@ def test_a_name_that_is_not_there_is_a_key_error_with_the_nearest_one(circuit):
     assert len({name: circuit[name] for name in circuit}) == 1 + 1 + 1 + 6 + 9  # t, u, y, x, hats
 
 
+def test_what_is_done_to_the_plant_of_a_result_is_not_in_the_next_run():
+    words = {"observer": "none", "time": {"samples": 11, "horizon": 1.0}}
+    first = run("circuit", **words)
+    system = first.details.system
+    system.initial_state[:], system.units["e1"] = 9.0, "kV"
+    second = run("circuit", **words)
+    np.testing.assert_array_equal(second["e1"], first["e1"])
+    assert second.details.system.units["e1"] == "V"
+
+
 def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
     plant = {
         "name": "clash", "states": ["T", "e0_T"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
@@ -119,6 +129,21 @@ def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
     result = run(plant, time={"samples": 11})
     with pytest.raises(KeyError, match="both a parameter and a state"):
         _ = result.estimates["e0_T"]
+
+
+@pytest.mark.parametrize(("time", "solver", "message"), [
+    ({"horizon": -1.0}, {}, "time.horizon: expected a positive number, got -1.0"),
+    ({"horizon": np.inf}, {}, "time.horizon: expected a finite number, got inf"),
+    ({}, {"tol": np.nan}, "solver.tol: expected a finite number, got nan"),
+    ({}, {"name": "ipv"}, "solver.name: expected collocation or ivp, got 'ipv'; did you mean ivp?"),
+])
+def test_settings_of_a_single_step_are_checked_as_those_of_a_run(time, solver, message):
+    system = load_plant("circuit")
+    with refused(message):
+        simulate(system, TimeSettings(**time), SolverSettings(**solver))
+    if solver:
+        with refused(message):
+            observe(system, None, SolverSettings(**solver))
 
 
 def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
@@ -145,7 +170,7 @@ def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
 
 
 def test_the_folder_is_the_command_lines_byte_for_byte(circuit, tmp_path):
-    circuit.save(tmp_path / "python", figures=["gram"])
+    circuit.save(tmp_path / "python", figures="gram")
     gpebo(
         "run", "estimator=drem", "estimator.gamma=[1e8,1e10]", "time.horizon=8",
         "time.samples=201", "figures=[gram]", "hydra.run.dir=command", cwd=tmp_path,

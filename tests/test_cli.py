@@ -28,7 +28,7 @@ from processes import (
 )
 
 from gpebo_cli import run
-from gpebo_cli.cli.job import remove_if_empty
+from gpebo_cli.cli.job import destination, remove_if_empty
 from gpebo_cli.cli.listing import KINDS
 
 FAST = ["figures=none", "time.samples=51"]
@@ -235,6 +235,10 @@ WRONG = [
     (["figures", "paper_circit"], "did you mean paper_circuit?"),
     (["compare", "--srot", "x"], "did you mean --sort?"),
     (["run", "launcher=jobli"], "did you mean joblib?"),
+    (["run", "hydra.run.dir="], "hydra.run.dir is empty; give a folder"),
+    (["run", "-m", "time.horizon=1,2", "hydra.sweep.dir="], "hydra.sweep.dir is empty; give a"),
+    (["run", "-m", "time.horizon=range(5,1)"], "a sweep of no jobs: a range is empty"),
+    (["run", "-m", "estimator=glob(none*)"], "or glob(…) finds no file"),
     (["run", "-m", "plant=circuit,circut"], "plant=circut: there is no such plant"),
 ]
 
@@ -257,6 +261,11 @@ def test_a_failed_run_is_exit_code_1(tmp_path):
     assert_refused(done, "cannot create the folder ", "taken: File exists\n", code=1)
 
 
+def test_a_folder_may_be_in_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert destination("hydra.run.dir", "~/mine") == str(tmp_path / "mine")
+
+
 def test_a_traceback_when_it_is_asked_for(tmp_path):
     done = gpebo("run", "plant=circut", cwd=tmp_path, HYDRA_FULL_ERROR="1")
     assert done.returncode == 2
@@ -270,6 +279,7 @@ def test_a_traceback_when_it_is_asked_for(tmp_path):
     ("MemoryError('17 GB')", "there is not enough memory for this: 17 GB"),
     ("OSError(28, 'No space left', 'a.csv')", "a.csv: No space left"),
     ("OSError('gone')", "gone"),
+    ("FileNotFoundError(2, 'No such file')", "the current folder: No such file"),
 ])
 def test_an_unexpected_error_is_one_line_too(tmp_path, error, said):
     script = (
@@ -279,6 +289,16 @@ def test_an_unexpected_error_is_one_line_too(tmp_path, error, said):
     )
     done = python("-c", script, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (1, f"gpebo: error: {said}\n")
+
+
+def test_the_windows_of_somebodys_figures_do_not_matter():
+    """Those of a notebook are in the environment of what is started from it."""
+    script = (
+        "import os; from gpebo_cli.cli import app\n"
+        "app.main = lambda: print(os.environ['MPLBACKEND']) or 0\n"
+        "app.entry()"
+    )
+    assert python("-c", script, MPLBACKEND="module://none").stdout == "agg\n"
 
 
 @pytest.mark.skipif(os.name == "nt", reason="POSIX signals")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -347,6 +348,18 @@ def test_one_case_that_diverges_does_not_hide_the_others() -> None:
     low, high = figure.axes[1].get_ylim()
     assert low < 1e-12
     assert high > 1e199
+
+
+def test_figures_may_be_drawn_in_several_threads() -> None:
+    """matplotlib has one parser of formulas and one set of settings for all of them."""
+    result, before = make_result(samples=5), dict(mpl.rcParams)
+
+    def drawn(_number: int) -> bytes:
+        return style.file_content(dict(draw(result, ["gram"]))["gram"], "png")
+
+    with ThreadPoolExecutor(4) as pool:
+        assert set(pool.map(drawn, range(4))) == {drawn(0)}
+    assert dict(mpl.rcParams) == before
 
 
 @pytest.mark.parametrize("label", ["i_{", r"\nosuch{x}", r"\frac{1}", "_"])

@@ -123,6 +123,14 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
         ({"theta": 1.0}, r"theta has shape \(\), expected \(1,\)"),
         ({"u": None}, "B and u go together"),
         ({"names": Names(states=("a", "b"))}, "2 names of states for 6 of them"),
+        ({"names": Names(states="aacdef")}, "a is a state twice"),
+        ({"names": Names(states="abcdef", outputs="a")}, "a is a state and an output"),
+        ({"names": Names(inputs="t")}, "'t' cannot be a name of inputs; a name is made of letters"),
+        ({"names": Names(outputs=[3])}, "3 cannot be a name of outputs"),
+        ({"names": Names(states=["a", "$x$", *"cdef"])}, r"'\$x\$' cannot be a name of states"),
+        ({"names": Names(states=["parameters", *"bcdef"])}, "a state cannot be called parameters"),
+        ({"E": np.full((6, 6), np.nan)}, "E has an entry that is not finite"),
+        ({"E": [[10**400] * 6] * 6}, "E is not an array of real numbers"),
         ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(3, 5, 6\)"),
         ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1$"),
         ({"A": lambda t: circuit_A(t) / (t < 2)[:, None, None]}, "A is not finite at t = 2$"),
@@ -131,6 +139,20 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
 def test_what_does_not_fit_is_named(changes, message):
     with np.errstate(all="ignore"), pytest.raises(ConfigError, match=message):
         circuit(**changes).coefficients.taylor(np.array([1.0, 2.0, 3.0]), 0)
+
+
+def test_a_plant_has_arrays_of_its_own():
+    """Whoever gave them may go on with others, as in a loop over plants."""
+    A, C, theta, start = -np.eye(2), np.eye(2), np.ones(1), np.ones(2)
+    system = system_from_functions(
+        "two", np.eye(2), A, C=C, F=[[1.0], [0.0]], theta=theta, initial_state=start
+    )
+    for array in (A, C, theta, start):
+        array[:] = 7.0
+    found = system.coefficients.taylor(np.zeros(1), 0)
+    np.testing.assert_array_equal(found.A[0, 0], -np.eye(2))
+    np.testing.assert_array_equal(found.C[0, 0], np.eye(2))
+    assert (system.theta, *system.initial_state) == (1.0, 1.0, 1.0)
 
 
 def test_entries_that_come_later_and_outputs_that_are_not_known_are_named():

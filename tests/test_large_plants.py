@@ -17,6 +17,7 @@ from benchmarks import ladders
 from gpebo_cli import from_matrices, load_plant, run, system_from_functions
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import OnDemand
+from gpebo_cli.kernels.threads import single
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import series, taylor
 from gpebo_cli.numerics.collocation import solve
@@ -790,6 +791,17 @@ def test_what_is_computed_when_it_is_read_has_one_thread_of_blas_too():
             p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"
         ])
         assert set(found.threads) == {1}
+
+
+def test_threads_of_blas_are_what_they_were_when_the_last_of_several_runs_has_ended():
+    first, second = single(), single()
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threadpool_info()
+        first.__enter__()
+        with second:
+            first.__exit__(None, None, None)
+            assert {p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas"} == {1}
+        assert threadpool_info() == before
 
 
 def test_a_blas_that_is_loaded_between_two_runs_has_one_thread_too():

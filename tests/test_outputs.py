@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -203,6 +204,20 @@ def test_no_table_of_an_earlier_run_stays(tmp_path: Path) -> None:
         "summary.json",
     ]
     assert os.listdir(tmp_path / "figures") == ["states.png"]
+
+
+def test_two_runs_that_end_at_once_write_one_after_the_other(tmp_path: Path) -> None:
+    pytest.importorskip("fcntl")
+    first, second = make_result(samples=3), without_observer(make_result(samples=3))
+    thread = Thread(target=write, args=(second, tmp_path))
+    with files.alone(tmp_path):
+        thread.start()
+        thread.join(0.2)
+        assert os.listdir(tmp_path) == []
+        for name, make in tables.TABLES.items():
+            tables.write_table(tmp_path / f"{name}.csv", make(first))
+    thread.join()
+    assert sorted(os.listdir(tmp_path)) == ["config.yaml", "signals.csv", "summary.json"]
 
 
 def test_summary_has_the_evidence(tmp_path: Path) -> None:

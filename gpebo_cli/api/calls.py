@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, overload
@@ -253,10 +254,13 @@ def _configure(
     return configuration.complete(config, settings), system, settings
 
 
-@cache
+_parsed = cache(load_plant)
+
+
 def _shipped(name: str) -> DescriptorSystem:
     """A plant that comes with gpebo: it is parsed once, and what is recorded of it is kept."""
-    return load_plant(name)
+    system = _parsed(name)  # what a result has of it may be changed
+    return deepcopy(system, {id(system.coefficients): system.coefficients})
 
 
 def _recording(data: Choice | os.PathLike[str] | DataFrame | None) -> object:

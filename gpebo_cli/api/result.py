@@ -279,7 +279,7 @@ class Result:
 
         Args:
             folder: where to; it is created where needed.
-            figures: True for all, False for none, or names of some.
+            figures: True for all, False for none, or names of some, or one name.
 
         Returns:
             The folder.
@@ -288,6 +288,7 @@ class Result:
             ConfigError: a figure does not exist.
             GpeboError: a file cannot be written.
         """
+        figures = [figures] if isinstance(figures, str) else figures
         chosen = figures if isinstance(figures, bool) else list(figures)
         settings = self.details.settings
         output = replace(settings.output, figures=chosen)

@@ -32,6 +32,7 @@ def entry() -> None:
 
         warnings.simplefilter("ignore")
         os.environ["PYTHONWARNINGS"] = "ignore"  # of workers, too
+    os.environ["MPLBACKEND"] = "agg"  # figures are files; a notebook's need not be installed here
     try:
         code = main()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -89,6 +90,8 @@ def _failed(error: Exception, *, traceback_wanted: bool) -> int:
     if isinstance(error, OSError):
         _drop_stdout()  # a full disk behind it would be reported again when Python exits
         where = f"{error.filename}: " if error.filename is not None else ""
+        if isinstance(error, FileNotFoundError) and not where:  # os.getcwd's has no name
+            where = "the current folder: "
         return _report(f"{where}{error.strerror or error}", 1)
     what = f"internal error: {type(error).__name__}: {error}"
     return _report(f"{what} (set HYDRA_FULL_ERROR=1 for the traceback)", 1)

@@ -16,6 +16,7 @@ from gpebo_cli.cli import composition
 from gpebo_cli.cli.arguments import Arguments
 from gpebo_cli.cli.progress import Progress
 from gpebo_cli.configs import configuration
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.reading import as_seen_from_here
 
 if TYPE_CHECKING:
@@ -68,6 +69,13 @@ def run_job(job: Job, folder: str, *, quiet: bool, loud: bool) -> RunResult:
         progress("write")
         write_run(result, Path(folder), configuration.config_text(job.config))
     return result
+
+
+def destination(key: str, given: object) -> str:
+    """The folder that ``key`` names, absolute (ConfigError: it is empty, as an unset variable)."""
+    if not (path := str(given)):
+        raise ConfigError(f"{key} is empty; give a folder (the current one is .) or leave it away")
+    return os.path.abspath(os.path.expanduser(path))
 
 
 def remove_if_empty(folder: str) -> None:

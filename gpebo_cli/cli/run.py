@@ -51,7 +51,7 @@ def _once(config: DictConfig, arguments: Arguments) -> int:
         raise ConfigError(
             f"{word} is for a sweep; add -m and several values, as in -m estimator.gamma=1e6,1e8"
         )
-    from gpebo_cli.cli.job import read_job, remove_if_empty, run_job
+    from gpebo_cli.cli.job import destination, read_job, remove_if_empty, run_job
 
     job = read_job(config, arguments, draw=True)
     if job.settings.data.file == STDIN:
@@ -59,7 +59,7 @@ def _once(config: DictConfig, arguments: Arguments) -> int:
 
         return stream.run(job.settings, job.system)
     # Its name has parts of the configuration, which has been checked by now.
-    folder, given = os.path.abspath(str(config.hydra.run.dir)), arguments.given
+    folder, given = destination("hydra.run.dir", config.hydra.run.dir), arguments.given
     from gpebo_cli.results.files import make_folder
     from gpebo_cli.results.report import loud_lines, run_lines
 

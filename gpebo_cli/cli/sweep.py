@@ -25,7 +25,7 @@ from omegaconf import DictConfig, OmegaConf
 from gpebo_cli.cli import interrupts, workers
 from gpebo_cli.cli.arguments import Arguments, quoted
 from gpebo_cli.cli.hydra_errors import LIBRARY_ERRORS
-from gpebo_cli.cli.job import read_job, run_job
+from gpebo_cli.cli.job import destination, read_job, run_job
 from gpebo_cli.cli.sweep_progress import Watch, told
 from gpebo_cli.configs.locations import GROUPS
 from gpebo_cli.errors import ConfigError, GpeboError
@@ -100,7 +100,9 @@ def run_sweep(
     ``hydra.sweep`` that a sweep does not have, or a folder that it cannot have).
     """
     orders = config.hydra.sweeper
-    folder = Path(orders.resume or str(config.hydra.sweep.dir)).absolute()
+    if not jobs:
+        raise ConfigError("a sweep of no jobs: a range is empty, or glob(…) finds no file")
+    folder = Path(destination("hydra.sweep.dir", config.hydra.sweep.dir))
     if "${" in str(folder):  # Hydra would replace it in each job, and write elsewhere
         raise ConfigError(f"{folder}: ${{ in the path of a sweep; choose another hydra.sweep.dir")
     # Unresolved: Hydra numbers the folders of jobs, job by job.

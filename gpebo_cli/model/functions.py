@@ -27,6 +27,8 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES, Array, Coefficients, DescriptorSystem
 from gpebo_cli.model.entries import Entries, Places, entries_of, is_sparse, not_zero
+from gpebo_cli.model.plant import kind_of_name
+from gpebo_cli.schema import shown
 
 # (t), (t, u) or (t, u, y), t (N,), u (N, m) and y (N, r), real or complex -> (N, rows, columns), or
 # (N, m) for u, (N, n) for phi
@@ -289,6 +291,10 @@ def system_from_functions(
         raise ConfigError(f"plant {name}: B and u go together; one of them is missing")
     inputs = names_of("inputs", names.inputs, "u", m, name)
     outputs = names_of("outputs", names.outputs, "y", r, name)
+    states = names_of("states", names.states, "x", n, name)
+    unknowns = names_of("unknowns", names.unknowns, "theta", q, name)
+    kinds = {"a state": states, "an input": inputs, "an unknown": unknowns, "an output": outputs}
+    kind_of_name(f"plant {name}", kinds)
     fixed: dict[str, Array] = {}
     functions: dict[str, tuple[Function, ...]] = {}
     signals: dict[str, frozenset[str]] = {}
@@ -332,6 +338,8 @@ def system_from_functions(
                     f"plant {name}: {key} has shape {value.shape}, expected {shape} "
                     f"(the initial state has {n} entries)"
                 )
+            if key != "theta" and not np.isfinite(value).all():  # the truth need not be known
+                raise ConfigError(f"plant {name}: {key} has an entry that is not finite")
             fixed[key] = value
     return DescriptorSystem(
         name=name,
@@ -340,19 +348,19 @@ def system_from_functions(
         ),
         initial_state=x0,
         theta=fixed.get("theta", np.full(q, np.nan)),
-        states=names_of("states", names.states, "x", n, name),
+        states=states,
         inputs=inputs,
-        unknowns=names_of("unknowns", names.unknowns, "theta", q, name),
+        unknowns=unknowns,
         outputs=outputs,
     )
 
 
 def _numbers(entry: Any, where: str) -> Array:
     """An entry that is no function as an array."""
-    with suppress(TypeError, ValueError):
+    with suppress(TypeError, ValueError, OverflowError):
         found = np.asarray(entry.toarray() if is_sparse(entry) else entry)
         if not np.iscomplexobj(found):
-            return found.astype(np.float64, copy=False)
+            return found.astype(np.float64)  # a copy: the caller's may change
     raise ConfigError(f"{where} is not an array of real numbers")
 
 
@@ -379,7 +387,13 @@ def _rows(entry: Entry | None, inputs: int = 0) -> int:
 def names_of(
     kind: str, given: Sequence[str] | None, letter: str, count: int, plant: str
 ) -> tuple[str, ...]:
-    """The ``given`` names, or x1, x2, … (ConfigError: there are not ``count`` of them)."""
+    """The ``given`` names, or x1, x2, … (ConfigError: not ``count`` of them, or no names)."""
     if given and len(given) != count:
         raise ConfigError(f"plant {plant}: {len(given)} names of {kind} for {count} of them")
+    for one in given or ():
+        if not str(one).isidentifier() or one == "t":  # the time's
+            raise ConfigError(
+                f"plant {plant}: {shown(one)} cannot be a name of {kind}; a name is made of "
+                "letters, digits and _, starts with no digit, and is not t"
+            )
     return tuple(given) if given else tuple(f"{letter}{i + 1}" for i in range(count))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import keyword
 import re
 from collections import ChainMap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -79,22 +79,11 @@ def plant_from_mapping(
         "an unknown": tuple(unknowns),
         "an output": outputs,
     }
-    elsewhere = _kind_of_name(plant, kinds)
+    elsewhere = kind_of_name(plant, kinds)
     signals = {
         name: signal(name, place, elsewhere[name])
         for place, name in enumerate((*inputs, *outputs))
     }
-    clash = [name for name in unknowns if name.startswith("e0_") and name[3:] in states]
-    if clash:
-        raise ConfigError(
-            f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
-            f"the state {clash[0][3:]}; choose another name"
-        )
-    for name in {"parameters", "states"}.intersection((*unknowns, *states)):
-        raise ConfigError(
-            f"{plant}: {elsewhere[name]} cannot be called {name}; seconds_to_1pct_{name} in "
-            f"cases.csv is of all {name}"
-        )
     parameters = read_parameters(plant, mapping.get("parameters"), signals, elsewhere)
 
     everything = {**signals, **parameters}
@@ -253,8 +242,8 @@ def named_values(plant: str, key: str, value: object, example: str) -> dict[str,
     return {_name(plant, key, label): item for label, item in value.items()}
 
 
-def _kind_of_name(plant: str, kinds: Mapping[str, Iterable[str]]) -> dict[str, str]:
-    """Which kind each name is; refuses names given twice, because columns are found by name."""
+def kind_of_name(plant: str, kinds: Mapping[str, Collection[str]]) -> dict[str, str]:
+    """Which kind each name is (ConfigError: one is given twice, and columns are found by name)."""
     seen: dict[str, str] = {}
     for kind, names in kinds.items():
         for name in names:
@@ -262,6 +251,18 @@ def _kind_of_name(plant: str, kinds: Mapping[str, Iterable[str]]) -> dict[str, s
                 twice = f"{kind} twice" if seen[name] == kind else f"{seen[name]} and {kind}"
                 raise ConfigError(f"{plant}: {name} is {twice}; every name must be used once")
             seen[name] = kind
+    states, unknowns = kinds["a state"], kinds["an unknown"]
+    clash = [name for name in unknowns if name.startswith("e0_") and name[3:] in states]
+    if clash:
+        raise ConfigError(
+            f"{plant}: the unknown {clash[0]} has the name of the estimated initial error of "
+            f"the state {clash[0][3:]}; choose another name"
+        )
+    for name in {"parameters", "states"}.intersection((*unknowns, *states)):
+        raise ConfigError(
+            f"{plant}: {seen[name]} cannot be called {name}; seconds_to_1pct_{name} in "
+            f"cases.csv is of all {name}"
+        )
     return seen
 
 

@@ -35,6 +35,7 @@ from gpebo_cli.observers._base import (
 )
 from gpebo_cli.registry import Registry
 from gpebo_cli.regression.linear import LinearRegression
+from gpebo_cli.schema import read
 from gpebo_cli.settings import SolverSettings
 
 __all__ = [
@@ -80,4 +81,5 @@ def observe(
         SolverError: the tolerance cannot be reached.
     """
     observer = _OBSERVERS.build({"name": "gpebo", **settings})
-    return observer.observe(system, signals, solver or SolverSettings())
+    chosen = read(SolverSettings, vars(solver or SolverSettings()), "solver")
+    return observer.observe(system, signals, chosen)

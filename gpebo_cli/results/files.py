@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from math import isnan
 from pathlib import Path
 
@@ -30,6 +31,22 @@ def write_file(path: Path, chunks: Iterable[bytes]) -> None:
             raise
     except OSError as error:
         raise GpeboError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Whoever else enters this for ``folder`` waits, in other processes, too, until these end."""
+    number = None
+    try:
+        with suppress(ImportError, OSError):  # Windows and some file systems have no such locks
+            from fcntl import LOCK_EX, flock
+
+            number = os.open(folder, os.O_RDONLY)
+            flock(number, LOCK_EX)
+        yield
+    finally:
+        if number is not None:
+            os.close(number)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from pathlib import Path
+from threading import RLock
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,6 +40,7 @@ ROUNDING = 1e-16  # relative to the size of a signal, errors below this say noth
 _HUGE = 1e300  # an estimate that diverges further leaves the axis; the axis itself stays finite
 _PAD, _GAP = 0.05, 0.11  # inches: at the edges of a figure, and between panels
 _SHEET = Path(__file__).with_name("gpebo.mplstyle")
+_DRAWING = RLock()  # matplotlib's settings and its parser of formulas are those of all threads
 
 # These hold in every style: journals refuse Type 3 fonts, the ids in an SVG file do not vary, and
 # the room that is kept for a legend is that of its lines.
@@ -48,12 +50,14 @@ _ALWAYS: dict[str, Any] = {
 }
 
 
-def our_rc(style: str | None = None) -> AbstractContextManager[None]:
-    """Set our own style, or one of matplotlib's, for a while."""
+@contextmanager
+def our_rc(style: str | None = None) -> Iterator[None]:
+    """Set our own style, or one of matplotlib's, for a while, in one thread at a time."""
     from matplotlib import rc_context
 
     ours: Any = {**(sheet() if style is None else _style(style)), **_ALWAYS}  # keys are literals
-    return rc_context(ours)
+    with _DRAWING, rc_context(ours):
+        yield
 
 
 @cache
@@ -75,7 +79,8 @@ def check_look(style: str | None, labels: Mapping[str, str]) -> None:
         parser: Any = MathTextParser("path")
     for name, text in labels.items():
         try:
-            parser.parse(f"${text}$")
+            with _DRAWING:
+                parser.parse(f"${text}$")
         except ValueError:
             raise ConfigError(
                 f"labels.{name}: {shown(text)} is not mathematics that matplotlib can set; "
@@ -229,10 +234,11 @@ def compose(panels: Sequence[Panel], look: OutputSettings | None = None) -> Figu
 
 def draw_on(axes: Axes, panel: Panel) -> None:
     """Draw one panel on axes of somebody else's figure, in the settings that hold there."""
-    _fill(axes, panel, axes.bbox.height / axes.figure.dpi)
-    _set_across(axes, [panel])
-    if panel.legend:
-        _set_legend(axes, panel, axes.bbox.width)
+    with _DRAWING:
+        _fill(axes, panel, axes.bbox.height / axes.figure.dpi)
+        _set_across(axes, [panel])
+        if panel.legend:
+            _set_legend(axes, panel, axes.bbox.width)
 
 
 def new_figure(width: float, height: float, dpi: int = DPI) -> Figure:

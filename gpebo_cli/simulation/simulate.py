@@ -26,6 +26,7 @@ from gpebo_cli.reduction.strangeness_free import (
     strangeness_free_form,
 )
 from gpebo_cli.reduction.structure import Structure, growth_rates
+from gpebo_cli.schema import read
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import SHORT, few_elements, first_mesh, known_resolved, least_beside
@@ -50,8 +51,11 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
     Raises:
         ModelError: not uniquely solvable, index too high, or a rank changes within the horizon.
         SolverError: the tolerance cannot be reached, or the solution ends within the horizon.
-        ConfigError: an entry without a finite value, or one that is too large to compute with.
+        ConfigError: an entry without a finite value, or one that is too large to compute with, or
+            a setting out of its range.
     """
+    time = read(TimeSettings, vars(time), "time")
+    solver = read(SolverSettings, vars(solver), "solver")
     check_sizes(system, time.start + time.horizon * _SHARES)
     if not system.depends_on_outputs:
         simulation = None

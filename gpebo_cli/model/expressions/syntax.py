@@ -13,7 +13,6 @@ import keyword
 import math
 import numbers
 import re
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -48,6 +47,8 @@ _ACCEPTED = "accepted: numbers, names, + - * / **, t, pi, " + ", ".join(
     [*nodes.FUNCTIONS, "min(., .), max(., .), d(.), step(.)"]
 )
 _FOREIGN = re.compile(r"[^A-Za-z0-9_.+\-*/(), \t\r\n]")
+# Python warns of "1if t", and what it warns of can only be ignored in all threads.
+_GLUED = re.compile(r"\b(\d\w*?(?:\.\w*?)?)(and|else|for|if|in|is|not|or)")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,10 +160,8 @@ def _syntax_tree(text: str) -> ast.expr:
         hint = "write ** for powers" if foreign[0] == "^" else _ACCEPTED
         raise FoldError(f"the character {foreign[0]!a} has no meaning here; {hint}")
     try:
-        with warnings.catch_warnings():  # Python warns of text such as "1if t"
-            warnings.simplefilter("ignore")
-            # Line breaks (folded YAML text) would end the expression for Python.
-            return ast.parse(" ".join(text.split()), mode="eval").body
+        # Line breaks (folded YAML text) would end the expression for Python.
+        return ast.parse(_GLUED.sub(r"\1 \2", " ".join(text.split())), mode="eval").body
     except (SyntaxError, ValueError) as error:
         reason = getattr(error, "msg", None) or str(error)
         if "nested parentheses" in reason:
