@@ -33,8 +33,9 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.guess import _factor, guess
 from gpebo_cli.recordings.hold import edges, held, recording_mesh
+from gpebo_cli.recordings.lines import DATE, LineReader, seconds
 from gpebo_cli.recordings.load import load
-from gpebo_cli.recordings.table import DATE, LineReader, read_table, seconds
+from gpebo_cli.recordings.table import read_table
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)

@@ -17,7 +17,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.table import LineReader, samples
+from gpebo_cli.recordings.lines import LineReader, samples
 from gpebo_cli.results.tables import rows_text
 from gpebo_cli.settings import Settings
 

@@ -20,7 +20,8 @@ from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.text import Piecewise, TextCoefficients
 from gpebo_cli.reading import beside
 from gpebo_cli.recordings.hold import bends
-from gpebo_cli.recordings.table import TIME, read_table
+from gpebo_cli.recordings.lines import TIME
+from gpebo_cli.recordings.table import read_table
 from gpebo_cli.schema import keys, read
 from gpebo_cli.settings import Between, DataSettings, TableFormat
 

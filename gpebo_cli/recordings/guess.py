@@ -18,15 +18,8 @@ from operator import ne
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.table import (
-    DATE,
-    MISSING,
-    TIME,
-    check_text,
-    read_file,
-    seconds,
-    typed_table,
-)
+from gpebo_cli.recordings.lines import DATE, MISSING, TIME, seconds
+from gpebo_cli.recordings.table import check_text, read_file, typed_table
 
 _SEPARATORS = (",", ";", "\t", " ")
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1,

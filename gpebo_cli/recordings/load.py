@@ -14,7 +14,8 @@ from gpebo_cli.numerics.mesh import SNAP, Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, recording_mesh
-from gpebo_cli.recordings.table import Samples, Table, read_table
+from gpebo_cli.recordings.lines import Samples
+from gpebo_cli.recordings.table import Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
 from gpebo_cli.settings import DataSettings, TimeSettings
 
