@@ -100,6 +100,12 @@ def plain(value: object) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else value
 
 
+@lru_cache(maxsize=64)
+def checked(settings: T, where: str) -> T:
+    """Settings that were made without :func:`read`, as that has them (ConfigError)."""
+    return read(type(settings), vars(settings), where)
+
+
 def read(cls: type[T], mapping: object, where: str) -> T:
     """An instance of the dataclass ``cls`` from plain data.
 

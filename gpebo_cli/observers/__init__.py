@@ -35,7 +35,7 @@ from gpebo_cli.observers._base import (
 )
 from gpebo_cli.registry import Registry
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.schema import read
+from gpebo_cli.schema import checked
 from gpebo_cli.settings import SolverSettings
 
 __all__ = [
@@ -81,5 +81,4 @@ def observe(
         SolverError: the tolerance cannot be reached.
     """
     observer = _OBSERVERS.build({"name": "gpebo", **settings})
-    chosen = read(SolverSettings, vars(solver or SolverSettings()), "solver")
-    return observer.observe(system, signals, chosen)
+    return observer.observe(system, signals, checked(solver or SolverSettings(), "solver"))

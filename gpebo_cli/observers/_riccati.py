@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dgetrf, dgetrs
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.kernels.arrays import joined
@@ -105,6 +104,8 @@ def pair(P: Array, estimate: Array) -> Array:
 
 def _renewed(X: Array) -> Array:
     """``pair(*quotient(X))`` of one pair, in less than half the time: there are many edges."""
+    from scipy.linalg.lapack import dgetrf, dgetrs
+
     n = len(X) // 2
     factors, pivots, singular = dgetrf(X[:n, :n])
     if singular:

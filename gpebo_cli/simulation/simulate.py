@@ -26,7 +26,7 @@ from gpebo_cli.reduction.strangeness_free import (
     strangeness_free_form,
 )
 from gpebo_cli.reduction.structure import Structure, growth_rates
-from gpebo_cli.schema import read
+from gpebo_cli.schema import checked
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import SHORT, few_elements, first_mesh, known_resolved, least_beside
@@ -54,8 +54,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
         ConfigError: an entry without a finite value, or one that is too large to compute with, or
             a setting out of its range.
     """
-    time = read(TimeSettings, vars(time), "time")
-    solver = read(SolverSettings, vars(solver), "solver")
+    time, solver = checked(time, "time"), checked(solver, "solver")
     check_sizes(system, time.start + time.horizon * _SHARES)
     if not system.depends_on_outputs:
         simulation = None
