@@ -168,6 +168,8 @@ def _syntax_tree(text: str) -> ast.expr:
             reason = "it is nested too deeply"
         elif "integer string conversion" in reason:
             reason = "a number in it is too large"
+        elif "decimal literal" in reason:
+            reason = "write * between a number and a name, as in 2*t"
         else:
             reason = "it is not an expression (" + reason.split(" (<")[0].rstrip(".") + ")"
         raise FoldError(reason) from None
