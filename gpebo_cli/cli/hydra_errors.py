@@ -51,7 +51,10 @@ def explain(error: BaseException, arguments: Arguments) -> str:
             f"its keys ({key}.KEY=VALUE), or leave --config-name away"
         )
     if match := _QUOTED.search(text):
-        return _unknown_key(match[1], cause)
+        said = _unknown_key(match[1], cause)
+        if any(word.lstrip("+~").startswith("regression.") for word in arguments.given.words):
+            said = re.sub(r"\bplant(?=\.| has)", "regression", said)  # as which it is stored
+        return said
     if isinstance(cause, OmegaConfBaseException):
         text = f"{text}: {cause.msg or cause}" if text else str(cause.msg or cause)
     return _one_line(text)
