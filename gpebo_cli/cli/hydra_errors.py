@@ -108,9 +108,6 @@ def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
 
 def _unknown_key(key: str, cause: BaseException | None) -> str:
     """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
-    from gpebo_cli.model import plant
-    from gpebo_cli.regression import text
-
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
         return _one_line(f"{key}: {getattr(cause, 'msg', None) or 'it cannot be set'}")
@@ -137,8 +134,12 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         and missing in child
     ]
     hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
-    if path == "plant" and missing in (*plant.KEYS, *text.KEYS):
-        hint = f"; '+{full}=VALUE' adds it"
+    if path == "plant":
+        from gpebo_cli.model import plant
+        from gpebo_cli.regression import text
+
+        if missing in (text.KEYS if "psi" in parent else plant.KEYS):
+            hint = f"; '+{full}=VALUE' adds it"
     if path in GROUPS and parent.get("name") == "none":
         others = [name for name in choices(conf_folder(), path) if name != "none"]
         hint = f"; choose {' or '.join(f'{path}={name}' for name in others)} first"
