@@ -51,10 +51,7 @@ def explain(error: BaseException, arguments: Arguments) -> str:
             f"its keys ({key}.KEY=VALUE), or leave --config-name away"
         )
     if match := _QUOTED.search(text):
-        said = _unknown_key(match[1], cause)
-        if any(word.lstrip("+~").startswith("regression.") for word in arguments.given.words):
-            said = re.sub(r"\bplant(?=\.| has)", "regression", said)  # as which it is stored
-        return said
+        return _unknown_key(match[1], cause, arguments)
     if isinstance(cause, OmegaConfBaseException):
         text = f"{text}: {cause.msg or cause}" if text else str(cause.msg or cause)
     return _one_line(text)
@@ -106,7 +103,7 @@ def _unparsable(error: OverrideParseException, arguments: Arguments) -> str:
     )
 
 
-def _unknown_key(key: str, cause: BaseException | None) -> str:
+def _unknown_key(key: str, cause: BaseException | None, arguments: Arguments) -> str:
     """The message for a key that does not exist; OmegaConf's error still knows its neighbours."""
     parent = getattr(cause, "parent_node", None)
     if not isinstance(parent, DictConfig):
@@ -117,6 +114,8 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
     if not path:
         known += [group for group in GROUPS if group not in known]
     missing = key.removeprefix(path).lstrip(".").partition(".")[0]
+    if any(word.lstrip("+~").startswith("regression.") for word in arguments.given.words):
+        path = re.sub("^plant", "regression", path)  # as which it is stored
     missing = missing or str(getattr(cause, "key", ""))  # of a mapping that was given as a whole
     full = f"{path}.{missing}" if path else missing
     if not known:
@@ -134,7 +133,7 @@ def _unknown_key(key: str, cause: BaseException | None) -> str:
         and missing in child
     ]
     hint = f"; did you mean {deeper[0]}?" if deeper else nearest(missing, known)
-    if path == "plant":
+    if path in {"plant", "regression"}:
         from gpebo_cli.model import plant
         from gpebo_cli.regression import text
 
