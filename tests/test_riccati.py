@@ -15,6 +15,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers import _riccati
 from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import (
     Filtered,
@@ -409,9 +410,9 @@ def test_a_chain_of_many_states_needs_few_elements():
 
 
 def test_a_filter_that_forgets_fast_is_cut_for_it_at_once():
-    """Nearly exact measurements and process noise: rates of 3,000/s, of which P shows nothing."""
+    """Nearly exact measurements and process noise: rates of 100/s, of which P shows nothing."""
     A, c = np.array([[-0.2, 1.0], [-1.0, -0.2]]), np.array([[0.0, 1.0]])
-    V, asked = np.array([[1e-8]]), []
+    V, asked = np.array([[1e-5]]), []
 
     def model(t, inside):
         asked.append(len(t))
@@ -430,7 +431,69 @@ def test_a_filter_that_forgets_fast_is_cut_for_it_at_once():
     P, _ = found.at(np.array([2.0]))
     d = np.sqrt(np.diag(expected))
     assert np.abs((P[0] - expected) / np.outer(d, d)).max() < found.error_estimate < 1e-4
-    assert sum(asked) < 110_000  # times, of all meshes that it went through
+    assert sum(asked) < 15_000  # times, of all meshes that it went through
+
+
+@pytest.mark.parametrize("elements", [1, 20])
+def test_a_filter_that_is_very_fast_follows_on_few_elements(elements):
+    """P' = 2aP + q − P²/V has two roots, P₊ and P₋; (P − P₊)/(P − P₋) decays like exp(−2λt)."""
+    a, q, V = -0.3, 0.1, 1e-10
+
+    def model(t, inside):
+        one = np.ones((1, 1, 1))
+        z = 1.0 + 0.0 * t[:, None, None]
+        return StateSpace(a * one, 0.5 * one, one, z, q * one, 0.0 * one, V * one), ()
+
+    mesh = initial_mesh(0.0, 2.0, [], elements, radau_rule(14))
+    found = run_filter(
+        model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-9, max_elements=1000
+    )
+    fast = np.sqrt(a * a + q / V)
+    upper, lower = V * (a + fast), V * (a - fast)
+    t = np.geomspace(1e-11, 2.0, 50)
+    left = (1.0 - upper) / (1.0 - lower) * np.exp(-2.0 * fast * t)
+    beside = -np.expm1(-2.0 * fast * t) + np.exp(-2.0 * fast * t) * (upper - lower) / (1.0 - lower)
+    expected = (upper - left * lower) / beside
+    P, estimate = found.at(t)
+    assert np.abs(P[:, 0, 0] / expected - 1.0).max() < 2.0 * found.error_estimate < 1e-8
+    settled = (0.5 + upper / V) / (upper / V - a)
+    np.testing.assert_allclose(estimate[-1, 0, 0], settled, rtol=1e-9)
+    assert found.mesh.size < 150  # X₁ grows by exp(60,000)
+
+
+def test_a_very_fast_filter_of_many_states_is_that_of_the_linear_equation(monkeypatch):
+    """States in other units, noises that are correlated, signals that jump, measured twice."""
+    random = np.random.default_rng(5)
+    unit = np.array([1.0, 1e4, 1e-3, 1.0])
+    A, c = random.normal(size=(4, 4)) - 2.0 * np.eye(4), random.normal(size=(2, 4))
+    into = 0.3 * random.normal(size=(4, 4))
+    D = np.concatenate([1e-3 * random.normal(size=(2, 2)), np.zeros((2, 2))], axis=1)
+
+    def model(t, inside):
+        At = A + np.sin(2.0 * t)[:, None, None] * into
+        b = np.where(inside > 0.3, 1.0, -1.0)[:, None, None] * np.ones((4, 1))
+        z = np.cos(t)[:, None, None] * np.array([[1.0], [2.0]])
+        column = unit[:, None]
+        return StateSpace(
+            At * column / unit, b * column, (c / unit)[None], z,
+            (into @ into.T * column * unit)[None], (column * (into @ D.T))[None], (D @ D.T)[None],
+        ), ()
+
+    def filtered():
+        mesh = initial_mesh(0.0, 0.5, [0.3], 2, radau_rule(14))
+        P0 = np.diag(unit**2)
+        return run_filter(model, np.zeros((4, 1)), P0, mesh, tol=1e-10, max_elements=20_000)
+
+    directly = filtered()
+    monkeypatch.setattr(_riccati, "_STIFF", np.inf)
+    linear = filtered()
+    t = np.linspace(0.0, 0.5, 41)[1:]
+    (P, estimate), (other, same) = directly.at(t), linear.at(t)
+    d = np.sqrt(np.einsum("tii->ti", P))
+    assert directly.mesh.size < 0.2 * linear.mesh.size
+    assert (np.abs(P - other) / (d[:, None] * d[:, :, None])).max() < linear.error_estimate < 1e-3
+    np.testing.assert_allclose(estimate / unit[:, None], same / unit[:, None], atol=1e-5)
+    assert directly.error_estimate < 1e-7
 
 
 @pytest.mark.parametrize("n", [1, 4])

@@ -18,12 +18,14 @@ equation (Reid; Bittanti, Laub & Willems, The Riccati Equation, 1991):
 Half of its solutions grow as fast as the filter forgets, so X₁ and X₂ soon differ by rounding only
 in the directions that do not grow. At every edge of the mesh the same P and ζ̂ therefore start
 anew from (I, P | 0, ζ̂). The Hamiltonian's transition of every element does not depend on them;
-what is chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹.
+what is chained are linear-fractional maps P₊ = (Ψ₂₁ + Ψ₂₂P)(Ψ₁₁ + Ψ₁₂P)⁻¹. A filter that forgets
+within a small part of the mesh's elements is left to :mod:`gpebo_cli.observers._stiff_riccati`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -37,6 +39,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, signal_scale
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, Monitor
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.observers._stiff_riccati import of_covariance
 
 _INDEFINITE = 1e-6  # of P, relative: beyond, rounding has taken over
 # Standard deviations below this share of the largest one, each in its unit (see _units), are
@@ -51,6 +54,8 @@ _MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages
 _SLOW = 0.3  # if the logarithm of X₁ grows by no more in any of them
 _ROOM = 8  # times as many elements may be needed with few stages
 _SETTLED = 1e2  # the same at first, where P has settled: elements are to resolve it, too
+# Elements for X₁, for each one of the mesh as it is, from which on P itself costs no more, or
+_STIFF = 4  # 1 + (n/8)³ times as many.
 _GROWTH = 1e3  # of X₁ within an element, at most: as many digits of P are lost
 
 
@@ -215,10 +220,13 @@ def run_filter(
     problem = LinearProblem(coefficients, first, signals, name, renewal=_renewed)
     try:
         H = coefficients(mesh.points[:, 1], mesh.inside[:, 1]).A
-        first_mesh = _first_mesh(mesh, H, 0 if before else _STAGES, fastest, max_elements)
-        solution = solve(problem, first_mesh, tol=tol, max_elements=max_elements)
-        P, estimate = quotient(solution.trajectory.values)
-        error_estimate = _error(problem, solution.trajectory, followed)
+        first_mesh, stiff = _first_mesh(mesh, H, 0 if before else _STAGES, fastest, max_elements)
+        solved, asked = None, (problem, first_mesh, tol, max_elements, followed)
+        if stiff:  # a P that is singular, and grows fast, may be beyond Newton's method
+            with suppress(SolverError, np.linalg.LinAlgError):
+                solved = _with_error(of_covariance, *asked)
+        found, extras, error_estimate = solved or _with_error(of_pairs, *asked)
+        mesh, (P, estimate) = found.mesh, quotient(found.values)
     except np.linalg.LinAlgError as error:
         raise SolverError(f"the Riccati equation of the {name} has no finite solution") from error
     except SolverError as error:
@@ -228,40 +236,43 @@ def run_filter(
     size = np.maximum(np.abs(np.einsum("kjii->kji", P)).sum(axis=2), np.finfo(float).tiny)
     relative = np.linalg.eigvalsh(P)[..., 0] / size
     if relative.min() < -_INDEFINITE:
-        t = solution.trajectory.mesh.points.flat[np.argmax(relative < -_INDEFINITE)]
+        t = mesh.points.flat[np.argmax(relative < -_INDEFINITE)]
         raise SolverError(
             f"the covariance of the {name} is not positive semidefinite near t = {t:.6g} "
             f"(eigenvalue {relative.min():.1e} of its trace); {advice}"
         )
-    mesh = solution.trajectory.mesh
-    kinds = followed(estimate, solution.extras)
+    kinds = followed(estimate, extras)
     largest = [np.abs(signal).max(axis=(0, 1)) for signal, _ in kinds]
     return Filtered(
-        solution.trajectory, variance, unit, error_estimate,
-        tuple(Trajectory(mesh, extra) for extra in solution.extras), tol,
+        found, variance, unit, error_estimate,
+        tuple(Trajectory(mesh, extra) for extra in extras), tol,
         tuple(map(np.maximum, largest, before.sizes) if before else largest),
     )
 
 
-def _first_mesh(mesh: Mesh, H: Array, least: int, fastest: float, max_elements: int) -> Mesh:
+def _first_mesh(
+    mesh: Mesh, H: Array, least: int, fastest: float, max_elements: int
+) -> tuple[Mesh, bool]:
     """A mesh that may resolve P, of ``least`` stages or more, from H (K or 1, 2n, 2n) by element.
 
-    At first P falls as fast as ``fastest``, in 1/s. How fast X₁ grows where P has settled is known
-    beforehand, too: cuts by one round after the other would go through many meshes.
+    And whether that is one for P itself. At first P falls as fast as ``fastest``, in 1/s. How fast
+    X₁ grows where P has settled is known beforehand, too: cuts by one round after the other would
+    go through many meshes.
     """
     growth = mesh.steps * np.linalg.eigvals(H).real.max(axis=1)
     stages = max(mesh.rule.stages, least)
     if _MANY < mesh.size < max_elements / _ROOM and growth.max() < _SLOW:
         stages = min(stages, _FEW)
     parts = np.ceil(growth / np.log(_SETTLED)).clip(1.0)
-    if parts.sum() <= max_elements:
+    stiff = bool(parts.sum() > _STIFF * (1.0 + (H.shape[1] / 16) ** 3) * mesh.size)
+    if not stiff and parts.sum() <= max_elements:
         mesh, _ = mesh.split(parts.astype(np.intp))
     # P falls as 1/t: what is not resolved first spoils all that follows. It may fall in less than
     # times far from zero are told apart.
     begin = mesh.edges[0]
     edges, halves = mesh.edges - begin, int(np.log2(max(fastest * mesh.steps[0], 1.0)))
     edges = np.insert(edges, 1, edges[1] * np.exp2(np.arange(-halves, 0)))
-    return Mesh(edges, radau_rule(stages), mesh.origin + begin)
+    return Mesh(edges, radau_rule(stages), mesh.origin + begin), stiff
 
 
 def _scaled(
@@ -306,27 +317,34 @@ def _deviations(P: Array) -> Array:
     return np.asarray(np.maximum(d, least))
 
 
-def _error(
-    problem: LinearProblem, found: Trajectory,
-    followed: Callable[[Array, tuple[Array, ...]], list[Kind]],
-) -> float:
-    """Error of P beside deviations at each time, and of what follows ζ̂ beside its own size.
+def of_pairs(
+    problem: LinearProblem, mesh: Mesh, tol: float, max_elements: int
+) -> tuple[Trajectory, tuple[Array, ...]]:
+    """The solution of the linear equation and the extras, as ``of_covariance`` gives them."""
+    found = solve(problem, mesh, tol=tol, max_elements=max_elements)
+    return found.trajectory, found.extras
 
-    As seen by solving with halves of the elements.
+
+def _with_error(
+    way: Callable[..., tuple[Trajectory, tuple[Array, ...]]], problem: LinearProblem, mesh: Mesh,
+    tol: float, max_elements: int, followed: Callable[[Array, tuple[Array, ...]], list[Kind]],
+) -> tuple[Trajectory, tuple[Array, ...], float]:
+    """What one ``way`` finds, and its error, as seen by solving with halves of the elements.
+
+    Of P beside deviations at each time, and of what follows ζ̂ beside its own size.
     """
-    mesh, _ = found.mesh.split(np.full(found.mesh.size, 2, dtype=np.intp))
-    finer = solve(
-        replace(problem, monitor=None, told=True), mesh, tol=np.inf, max_elements=mesh.size
-    )
-    values = finer.trajectory.values
-    (P, estimate), (other, same) = quotient(values), quotient(mesh.along(found).values)
+    found, extras = way(problem, mesh, tol, max_elements)
+    halves, _ = found.mesh.split(np.full(found.mesh.size, 2, dtype=np.intp))
+    finer, there = way(replace(problem, monitor=None, told=True), halves, np.inf, halves.size)
+    P, estimate = quotient(finer.values)
+    other, same = quotient(halves.along(found).values)
     d = _deviations(P)
     error = float((np.abs(other - P) / (d[:, None, :, None] * d[:, None, None, :])).max())
-    kinds = zip(followed(estimate, finer.extras), followed(same, finer.extras), strict=True)
+    kinds = zip(followed(estimate, there), followed(same, there), strict=True)
     for (one, floor), (two, _) in kinds:
         size = np.maximum(signal_scale(one), floor)
         error = max(error, float((np.abs(one - two) / size).max(initial=0.0)))
-    return error
+    return found, extras, error
 
 
 def _units(A: Array, deviation: Array, horizon: float, sizes: Array | float) -> Array:
