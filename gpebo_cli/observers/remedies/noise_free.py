@@ -71,7 +71,8 @@ def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observatio
     along = reduced_system(
         replace(system, coefficients=copy), reduced.signals, reduced.solver,
         weights=((reduced.first.output_scale * reduced.form.units.outputs) ** 2).tolist(),
-        regression=reduced.regression, form="given", units=reduced.form.units,
+        regression=reduced.regression, units=reduced.form.units,
+        form="strangeness_free" if reduced.form.structure else "given",
     )
     return Plain().observe(replace(along, xi_a0=reduced.xi_a0))
 
