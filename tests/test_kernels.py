@@ -14,6 +14,7 @@ import pytest
 from kernel_paths import needs_kernels
 
 from gpebo_cli import kernels
+from gpebo_cli.kernels import structure_numpy
 from gpebo_cli.numerics.elimination import steps_of
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.radau import radau_rule
@@ -570,3 +571,17 @@ def test_the_largest_pivot_may_be_negative():
     one, other = both_kinds_answer("elements", "element_maps", *arguments)
     for mine, reference in zip(one, other, strict=True):
         np.testing.assert_allclose(mine, reference, rtol=1e-9, atol=1e-13 * np.abs(reference).max())
+
+
+@pytest.mark.parametrize("twin", [kernels.structure, structure_numpy])
+@pytest.mark.parametrize("rest", [2e-16, 1e-15])
+def test_elimination_fails_where_its_pivots_are_singular_to_rounding(twin, rest):
+    """M22 − X M12 is zero there, and M21 − X M11 is not: constraints would be wrong by as much."""
+    M = np.array([[[0.3, 0.1, 0.0], [0.9, 0.3 + rest, 0.0], [0.6, 0.2, 0.0]]])
+    order, one, scale = np.arange(3), np.eye(3)[None], np.ones(3)
+    pivots = order, order, 2, np.eye(3)[:, :2].copy()
+    assert twin.bounds(M[None], one[None], scale, scale, 1.0, 1, *pivots)[1][0] > 1e-3
+    *_, poor = structure_numpy.by_elimination(
+        one, M, one, np.ones((1, 3, 1)), *pivots, 1, 3e2, 1e-13
+    )
+    assert poor.all()

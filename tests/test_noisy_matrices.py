@@ -76,6 +76,40 @@ def test_without_noise_the_copy_changes_nothing():
             assert observation.assumptions[-1].evidence["rounds"] == 2  # one shows that none is due
 
 
+@pytest.mark.parametrize(("form", "of_force", "sigma"), [
+    ("auto", 0, 0.0), ("strangeness_free", 0.3, 0.02),
+])  # fmt: skip
+def test_the_copy_is_observed_on_the_form_of_the_equations_that_is_chosen(form, of_force, sigma):
+    """Of index 2; an output that sees no force leaves that form alone."""
+    system = plant_from_mapping({
+        "name": "held", "states": ["x", "s", "f"], "outputs": ["y"], "unknowns": {"k": 0.7},
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "A": [["-0.2*y**2", 0, 1], ["-y", 0, 1], [0, 1, 0]],
+        "F": [["cos(2*y)"], [0], [0]], "phi": [0, 0, "-sin(t)"], "C": [[1, 0.5, of_force]],
+        "initial_state": [1, 0, 2],
+    })  # fmt: skip
+    run = run_experiment(Settings(
+        estimator=LEAST_SQUARES, time=TimeSettings(horizon=2.0, samples=11),
+        observer={"name": "gpebo", "remedy": "noise_free", "form": form},
+        noise=NoiseSettings("gaussian", 0.2, sigma), solver=SolverSettings(tol=1e-8),
+    ), system)  # fmt: skip
+    errors = run.estimation.parameters[0, -1] - run.estimation.true_parameters[-1]
+    within = 3.0 * run.estimation.parameters_std[0, -1] if sigma else 1e-6
+    assert (np.abs(errors) < within).all()
+    assert ("observer on the strangeness-free form" in run.verdict) == (form == "auto")
+
+
+def test_the_copy_is_on_its_side_of_what_an_input_switches():
+    """An output whose matrix has a relay: rounding of the input decided at the ends of elements."""
+    system = plant_from_mapping({
+        "name": "relay", "states": ["x", "z"], "inputs": {"u": "cos(2*t)"}, "outputs": ["y", "v"],
+        "E": [[1, 0], [0, 0]], "A": [["-0.3*y", 1], [1, "2 + sin(y)"]], "phi": [0, "-sin(t)"],
+        "C": [[1, "sign(u)"], [1, 0]], "initial_state": [0, 1],  # which the observer knows: Y = 0
+    })  # fmt: skip
+    signals = simulate(system, TimeSettings(horizon=3.0), SolverSettings()).signals
+    seen = Measurements(signals.inputs, signals.outputs)
+    assert observe(system, seen, remedy="noise_free").error_estimate < 1e-6
+
+
 def test_unknowns_in_a_noisy_output_are_linearised_with_it():
     """y = x + b, x' = −y² + θ: with the bias b of the sensor, which is not the output's noise."""
     def plant(theta, bias, start):

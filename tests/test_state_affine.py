@@ -375,6 +375,15 @@ def test_a_narrow_pulse_that_an_output_passes_is_seen(width, where, horizon, uni
     assert found.bounded
 
 
+@pytest.mark.parametrize("dead", ["max(0, y - 10)*sin(y)", "exp(y)*(max(y, 5) - 5)"])
+def test_what_is_zero_all_along_hides_nothing(dead):
+    """A stop that is never reached: its bounds are rounding of zero, which no cell is short for."""
+    given = one_state(A=[[dead]], phi=["cos(y) - y"], initial_state=[1.0])
+    found = simulate(plant_from_mapping(given), TimeSettings(horizon=3.0), SOLVER)
+    assert found.bounded
+    assert found.signals.mesh.size < 30
+
+
 def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     """A transistor that is off; one that conducts has its conductance."""
     plant = plant_from_mapping({

@@ -99,12 +99,13 @@ EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, np
                n * sizeof(Lane));
 }
 
-/* With X in place: the residual M22 − X M12 and Â2 = N2 − X N1, [Z1ᵀE; Â2] into whole. */
+/* With X in place: the residual [M21 M22] − X [M11 M12], Â2 = N2 − X N1, [Z1ᵀE; Â2] into whole. */
 static void eliminate_blocks(const Model *m, Elimination *el)
 {
     const npy_intp n = m->n, r = el->rank, a = el->a;
+    lanes_multiply(el->M21, r, el->X, r, el->M11, r, a, r, r, SUBTRACT); /* M11 may be singular */
     lanes_multiply(el->M22, a, el->X, r, el->M12, a, a, r, a, SUBTRACT);
-    lanes_norm(el->residual, el->M22, a * a);
+    lanes_norm(el->residual, el->M21, a * (r + a));
     lanes_norm(el->of_X, el->X, a * r);
     lanes_multiply(el->N2, n, el->X, r, el->N1, n, a, r, n, SUBTRACT);
     lanes_from_left(el->whole, n, el->Z1, 1, el->d, el->e, el->d, n, n);
@@ -260,8 +261,7 @@ static void hand_over(double *out, Lane *x, npy_intp rows, npy_intp columns, npy
     lanes_store(out, x, rows, columns, 0, columns, first, used);
 }
 
-/* The equations at one block of times; 0 where the elimination grows more than `growth` or leaves
-   more than `residual`. Matrices that are constant are those of the first block. */
+/* The equations at a block of times, 0 beyond the limits; constant matrices are of the first. */
 static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first, npy_intp used,
                      npy_intp matrices, double growth, double residual, double *const *out)
 {

@@ -158,9 +158,9 @@ def bounds(
         σ_r(M) ≥ 1/‖M11⁻¹‖,      σ_min(Â2) ≥ 1/(‖W⁻¹‖ ‖Z2‖),      σ_min(E T2) ≥ 1/‖W⁻¹‖.
 
     Returns:
-        the bounds (N, 3), zero or NaN where a block is singular; what the elimination leaves of M22
-        relative to the size of M (N,); and the dynamics Z1ᵀA T (N, d, d), T being the first columns
-        of W⁻¹.
+        the bounds (N, 3), zero or NaN where a block is singular; what the elimination leaves of M21
+        and M22 relative to the size of M (N,); and the dynamics Z1ᵀA T (N, d, d), T being the first
+        columns of W⁻¹.
     """
     e, a = scaled(E, A, rows, columns, time, orders)
     M, N = derivative_array(e, a, orders - 1)
@@ -183,7 +183,7 @@ def bounds(
             found[:, 1] = 1.0 / (determined * spread * frobenius_norm(N))
         if d:
             found[:, 2] = 1.0 / (determined * frobenius_norm(e[0]))
-        left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:]) / size
+        left = frobenius_norm(M[:, r:] - X @ M[:, :r]) / size
         return found, left, Z1.T @ a[0] @ states[:, :, :d]
 
 
@@ -203,7 +203,7 @@ def by_elimination(
     with np.errstate(invalid="ignore", over="ignore"):
         inverse = inverses(M[:, :r, :r])
         X = M[:, r:, :r] @ inverse
-        left = frobenius_norm(M[:, r:, r:] - X @ M[:, :r, r:])
+        left = frobenius_norm(M[:, r:] - X @ M[:, :r])
         poor = ~((left <= residual * frobenius_norm(M)) & (frobenius_norm(X) <= growth))
         X[poor], inverse[poor] = 0.0, 0.0
         constraints = right[:, r:] - X @ right[:, :r]
@@ -226,7 +226,7 @@ def eliminated(*_: Any) -> tuple[Array, ...] | None:
 
     With the coefficients of f = B u + F θ, B (orders, N or 1, n, m), F (…, n, q), u (…, m) and θ
     (…, q), and the pivots of :func:`bounds`. The amplification is looked at at ``every`` so many
-    times; ``growth`` of the elimination and its relative ``residual`` in M22 are limits.
+    times; ``growth`` of the elimination and its relative ``residual`` are limits.
 
     Returns:
         E1, A1 (N, d, n), f1 (N, d), Â2 (N, a, n), f2 (N, a), T (N, n, d) and offset (N, n) of the

@@ -395,8 +395,8 @@ def switching(source: CoefficientSource) -> Tape | None:
 
 def sided(source: CoefficientSource, order: int = 0) -> Tape | None:
     """Arguments of what jumps where signals say so, up to an order, if there are any known."""
-    found = source.sided[min(order, 1)] if isinstance(source, FollowsSignals) else None
-    return found if found is not None and found.outputs else None
+    known = getattr(source, "sided", None)
+    return known[min(order, 1)] if known and known[min(order, 1)].outputs else None
 
 
 def blur_of(source: CoefficientSource, cuts: Array) -> Array:

@@ -98,6 +98,12 @@ class Linearised:
         t = mesh.points.ravel()
         return switched(self._switching, t, lambda t, order: self._along(t, order, t)[2])
 
+    @property
+    def sided(self) -> tuple[Tape, Tape] | None:
+        """Arguments that follow signals, of what jumps and of what switches: those of the plant."""
+        source = self.system.coefficients
+        return source.sided if isinstance(source, FollowsSignals) else None
+
     @cached_property
     def _switching(self) -> Tape | None:
         return switching(self.system.coefficients)

@@ -111,7 +111,8 @@ def resolved(bounds: Bounds, edges: Array, most: int = 0) -> tuple[Array, bool]:
     while True:
         # A bound that nothing reaches falls while its cell is cut.
         finite = np.where(np.isfinite(size), size, 0.0)
-        poor = (rest > RESOLVED * finite.max(axis=0)).any(axis=1) & (depth < _DEEPEST)
+        enough = np.maximum(RESOLVED * finite.max(axis=0), NOTHING)
+        poor = (rest > enough).any(axis=1) & (depth < _DEEPEST)
         if len(low) >= most or not poor.any():
             break
         middle = 0.5 * (low[poor] + high[poor])

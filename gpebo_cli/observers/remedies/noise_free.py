@@ -42,14 +42,14 @@ class NoiseFree:
         found, system = Plain().observe(reduced), reduced.system
         if not system.depends_on_outputs:
             return found
-        eta = found.regression.least_squares()
+        eta, y = found.regression.least_squares(), reduced.signals.outputs.values
         for count in range(1, _MOST_ROUNDS + 1):
             try:
                 found = _round(reduced, found, eta)
             except SolverError as error:
                 raise _unsettled(count, str(error)) from error
             before, eta = eta, found.regression.least_squares()
-            change = _change(found, before, eta, reduced.solver.tol)
+            change = _change(found, before, eta, reduced.solver.tol, float(np.abs(y).max()))
             if count >= _LEAST_ROUNDS and change <= _STILL:
                 break
         else:
@@ -71,9 +71,10 @@ def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observatio
     along = reduced_system(
         replace(system, coefficients=copy), reduced.signals, reduced.solver,
         weights=((reduced.first.output_scale * reduced.form.units.outputs) ** 2).tolist(),
-        regression=reduced.regression, form="given", units=reduced.form.units,
+        regression=reduced.regression, units=reduced.form.units,
+        form="strangeness_free" if reduced.form.structure else "given",
     )
-    return Plain().observe(replace(along, xi_a0=reduced.xi_a0))
+    return Plain().observe(replace(along, xi_a0=reduced.xi_a0, note=reduced.note))
 
 
 def _unsettled(count: int, why: str) -> SolverError:
@@ -83,11 +84,16 @@ def _unsettled(count: int, why: str) -> SolverError:
     )
 
 
-def _change(found: Observation, before: Array, after: Array, tol: float) -> float:
-    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981)."""
+def _change(
+    found: Observation, before: Array, after: Array, tol: float, size: float = 0.0
+) -> float:
+    """Root mean square of ψ(η̂₊ − η̂) in terms of that of the residual (Bates & Watts 1981).
+
+    Y is made of signals of a ``size``, and may be rounding of these.
+    """
     Y, psi = found.regression.Y.values, found.regression.psi.values
     residual = Y - psi @ after
-    floor = tol * float(np.abs(Y).max() + np.abs(psi @ after).max())
+    floor = tol * (size + float(np.abs(Y).max() + np.abs(psi @ after).max()))
     return float(np.linalg.norm(psi @ (after - before)) / (
         np.linalg.norm(residual) + floor / _STILL * np.sqrt(residual.size)
     ))
