@@ -227,8 +227,6 @@ UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8))
     ([UNEVEN], "linear", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
     ([UNEVEN], "linear", {"name": "least_squares", "f0": 0.1, "beta": 0.3},
      {"remedy": "reset", "reset_times": [2.0, 3.0], "reset_keep": 0.5}),
-    ([UNEVEN], "zoh", {"name": "least_squares", "f0": None},
-     {"remedy": "reset", "reset_times": [2.0], "reset_keep": 0}),
     ([PAUSE, UNEVEN], "linear", {"name": "least_squares"}, {}),
     ([PAUSE], "cubic", {"name": "least_squares"}, {}),
     ([PAUSE, UNEVEN], "cubic", {"name": "least_squares", "beta": 0.3}, {}),
