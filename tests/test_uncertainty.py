@@ -223,6 +223,8 @@ UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8))
     ([PAUSE], "linear", {"name": "least_squares"}, {}),
     ([PAUSE], "zoh", {"name": "least_squares"}, {}),
     ([PAUSE], "zoh", {"name": "least_squares"}, {"sample_time": 0.1, "hold": "zoh"}),
+    ([PAUSE], "linear", {"name": "least_squares"}, {"sample_time": 0.3, "hold": "linear"}),
+    ([UNEVEN], "linear", {"name": "ls_drem"}, {"sample_time": 0.1, "hold": "zoh"}),
     ([UNEVEN], "linear", {"name": "least_squares", "beta": 0.3}, {}),
     ([UNEVEN], "linear", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
     ([UNEVEN], "linear", {"name": "least_squares", "f0": 0.1, "beta": 0.3},
