@@ -226,6 +226,19 @@ def test_gradient_is_too_slow_for_two_of_them_and_says_so(remedy):
     assert not result.estimation.requirement.holds
 
 
+@pytest.mark.parametrize("estimator", ["least_squares", "ls_drem", "drem"])
+def test_a_time_that_misses_a_reset_by_rounding_is_behind_it(estimator):
+    """As x̂ = offset + gain η̂ is: η̂ of before it beside a state map of after it is no state."""
+    kept = [
+        run(shipped("descriptor"), 5.0, estimator={"name": estimator}, remedy="reset",
+            reset_times=[at]).estimation
+        for at in (2.0, np.nextafter(2.0, 3.0))
+    ]
+    one, other = (np.concatenate([e.parameters, e.true_parameters[None]]) for e in kept)
+    np.testing.assert_allclose(kept[1].states, kept[0].states, atol=1e-9)
+    np.testing.assert_allclose(other, one, atol=1e-9)
+
+
 @pytest.mark.parametrize("estimator", [{"name": "ls_drem"}, {"name": "drem"}, {"name": "mre"}])
 def test_resets_change_nothing_where_none_is_needed(estimator):
     system = shipped("circuit")

@@ -14,6 +14,7 @@ from gpebo_cli.estimators._registry import Several, SeveralEstimates, able
 from gpebo_cli.evidence.uncertainty import after_reset
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.mesh import beside_edges
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem, one_after_another
 from gpebo_cli.regression.estimator import (
     Affine,
@@ -84,7 +85,7 @@ def estimate(
             return in_windows(moving or estimator.go_on, regression, t, shown)
         return moving(regression, t, ()) if moving else estimator.estimate(regression, t)
     segments = regression.segments
-    first = np.searchsorted(t, [s.mesh.edges[0] for s in segments[1:]], side="left")
+    first = np.searchsorted(beside_edges(t), [s.mesh.edges[0] for s in segments[1:]], side="left")
     parts: list[ResumableEstimates] = []
     known: tuple[ExtensionState, ...] = ()
     resumable = able(estimator, Resumable, _GO_ON)
@@ -191,7 +192,7 @@ class Chain:
 
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,); it jumps where the parameters do."""
-        cuts = np.searchsorted(t, [reset.time for reset in self.resets], side="left")
+        cuts = np.searchsorted(beside_edges(t), [reset.time for reset in self.resets], side="left")
         pairs = zip(self.parts, np.split(t, cuts), strict=True)
         pieces = [part.delta(own) for part, own in pairs if len(own)]
         found = [piece for piece in pieces if piece is not None]

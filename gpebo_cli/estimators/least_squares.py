@@ -83,7 +83,10 @@ class LeastSquares(ResumableEstimator):
         return None if self.bound is None else number(self.bound, "estimator.bound")
 
     def errors(self, regression: LinearRegression, known: Known = ()) -> tuple[ErrorsAt, ...]:
-        """δh_z' = −β δh_z + ψᵀδY, δη̂ = α (z f₀ I + α G_z)⁻¹ δh_z, of every case."""
+        """δh_z' = −β δh_z + ψᵀδY, δη̂ = αF δh_z, of every case; after a reset η̂₀ has an error, too.
+
+        That of η̂ contains (I − αF G_z) δη̂₀.
+        """
 
         def at(
             case: Mapping[str, float], info: Information, t: Array, inside: Array
@@ -92,7 +95,10 @@ class LeastSquares(ResumableEstimator):
             rate = here.forgetting(case["alpha"], f0_of(case), case["beta"], self.covariance_bound)
             A = -rate[:, None, None] * np.eye(regression.p)
             C = here.covariance(case["alpha"], f0_of(case))
-            return ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
+            found = ErrorSystem(A, into, C, np.zeros((1, *into.shape[1:])))
+            if not known or regression.whole is not None:
+                return found
+            return found.with_constants(np.eye(regression.p) - C @ here.values[..., : regression.p])
 
         infos = self.informations(regression, known)
         return tuple(map(partial, repeat(at), self.cases, infos))

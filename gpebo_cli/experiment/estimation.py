@@ -247,7 +247,7 @@ def at_samples(
             wanted = settings.uncertainty and last
             online = Online(
                 settings, system, samples.hold, start, np.append(u[0], y[0]), by,
-                sampled_deviations(source.levels, source) if wanted else None,
+                sampled_deviations(source.levels, source, t) if wanted else None,
                 source.derivatives, columns,
             )
             made = []

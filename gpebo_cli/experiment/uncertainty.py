@@ -17,6 +17,7 @@ from gpebo_cli.regression.errors import ErrorsAt
 from gpebo_cli.regression.estimator import Affine, Estimator
 from gpebo_cli.regression.linear import LinearRegression
 
+_AT_ROW = 1e-6  # of a step: what is no farther from a row is there
 MOST_CASES = 32  # each takes a pass of its own; more are a study of gains, not of a measurement
 # Why there are no deviations.
 _MANY = f"each of {{}} cases would take a pass of its own, which up to {MOST_CASES} do"
@@ -32,8 +33,10 @@ _IN_MATRICES = (
 )
 
 
-def sampled_deviations(levels: NoiseLevels, source: Source | None) -> SampledDeviations | None:
-    """Deviations of an observer at samples; None if there is no noise.
+def sampled_deviations(
+    levels: NoiseLevels, source: Source | None, t: Array | None = None
+) -> SampledDeviations | None:
+    """Deviations of an observer at samples of times t (N,); None if there is no noise.
 
     Levels that are zero are unknown but for a simulation. Without a source the samples are a
     stream, each of whose rows has errors of its own.
@@ -50,10 +53,13 @@ def sampled_deviations(levels: NoiseLevels, source: Source | None) -> SampledDev
         instants = instants[: np.searchsorted(instants, source.inputs.mesh.edges[-1])]
     near = 1e-6 * float(np.diff(instants).min(initial=np.inf))
 
-    def number(t: Array) -> Array:
-        return np.searchsorted(instants, t + near, side="right").astype(np.float64)
+    def row(t: Array) -> tuple[Array, Array]:
+        number = np.searchsorted(instants, t + near, side="right").astype(np.float64)
+        share = np.interp(t, instants, np.arange(1.0, len(instants) + 1)) - number
+        return number, np.where(rows.lines & (share > _AT_ROW), share, 0.0)
 
-    return SampledDeviations(variances, number, relative=levels.silent)
+    between = t is not None and bool(row(t)[1].any())
+    return SampledDeviations(variances, row, relative=levels.silent, between=between)
 
 
 def none_at_samples(cases: int) -> str:

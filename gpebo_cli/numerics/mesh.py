@@ -157,7 +157,7 @@ class Mesh:
         # A sample that was meant to be an edge may miss it by rounding: snap to the right element.
         # Relative to t itself: next to t = 0 elements may be as short as a stiff transient.
         asked, rule, t = t, self.rule, np.asarray(t, dtype=np.float64) - self.origin
-        belongs = t + SNAP * np.abs(t) if inside is None else inside - self.origin
+        belongs = beside_edges(t) if inside is None else inside - self.origin
         found = Sampler(*signals.interpolation(
             self.edges, rule.points, rule.barycentric, t, belongs, _EXACT
         ))
@@ -169,6 +169,11 @@ class Mesh:
     def _sampler(self) -> list[Any]:
         """The last times that were few, and what came of them: several signals ask for the same."""
         return []
+
+
+def beside_edges(t: Array) -> Array:
+    """Times (M,) that reach an edge, or a sample, which those that are given miss by rounding."""
+    return np.asarray(t + SNAP * np.abs(t))
 
 
 @dataclass(frozen=True, eq=False)

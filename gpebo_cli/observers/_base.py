@@ -24,7 +24,7 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.model.expressions import on_their_side
 from gpebo_cli.model.text import sided
-from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, beside_edges
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold
 from gpebo_cli.reduction.form import InputDerivatives
@@ -238,7 +238,8 @@ class InitialError:
             xi_a0 - np.where(dual == 0.0, 0.0, dual * own).sum(axis=1)
             for (dual, xi_a0), own in zip(starts, x, strict=True)
         ])
-        return np.concatenate([theta, e0[np.searchsorted(times, t, side="right")]], axis=1)
+        reached = np.searchsorted(times, beside_edges(t), side="right")
+        return np.concatenate([theta, e0[reached]], axis=1)
 
 
 def _is_constant(theta: Array) -> bool:

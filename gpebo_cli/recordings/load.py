@@ -10,7 +10,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
 from gpebo_cli.model.text import FollowsSignals
-from gpebo_cli.numerics.mesh import SNAP, Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, beside_edges
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, recording_mesh
@@ -58,7 +58,7 @@ class Recording:
         """
         samples, m = self.table.samples, self.inputs.values.shape[2]
         signal = held(samples.t, np.hstack([samples.inputs, samples.outputs]), self.hold)
-        both = signal(t, t + SNAP * np.abs(t))
+        both = signal(t, beside_edges(t))
         return Samples(t, both[:, :m], both[:, m:], self.states(t))
 
 
