@@ -129,6 +129,7 @@ def test_words_of_a_sweep_are_refused_without_one(tmp_path, word):
         (["hydra.sweep.subdir=x"], "the folders of jobs are numbered"),
         (["estimator=drem,dremm"], "estimator=dremm: there is no such estimator"),
         (["estimator.gama=1,2"], "estimator.gama: no such key"),
+        (["experiment=gain_sweep,gain_multirun"], "experiment=gain_multirun: a sweep is"),
         (["hydra/launcher=joblibb"], "there is no such hydra/launcher; known: basic"),
     ],
 )

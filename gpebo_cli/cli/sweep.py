@@ -269,7 +269,11 @@ def _compositions(
         )
         if kind not in seen:
             seen.add(kind)
-            yield loader.load_sweep_config(config, list(job))
+            composed = loader.load_sweep_config(config, list(job))
+            if composed.hydra.sweeper.params != config.hydra.sweeper.params:
+                name = composed.hydra.runtime.choices.experiment
+                raise ConfigError(f"experiment={name}: a sweep is no job of another; run it alone")
+            yield composed
 
 
 def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:
