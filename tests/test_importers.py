@@ -120,7 +120,7 @@ NETLISTS = {  # name: (netlist, what is measured, index)
         "R2 c 0 1\nC2 c 0 1 ic=0\nH1 d 0 Vs 1.5\nR3 d e 1\nC3 e 0 1 ic=0\n"), "v(c),v(e)", 1,
     ),
     "subcircuits": (
-        ("sub\n.param rr=2\n.subckt filt in out r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c}\n"
+        ("sub\n.param rr=2\n.subckt filt in out PARAMS: r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c}\n"
         ".ic v(out)=0.4\n.ends\nV1 in 0 SIN(0 1 0.3)\nX1 in m filt r=0.5\n"
         "X2 m o filt c=0.3\n"), "v(o)", 1,
     ),
@@ -273,6 +273,8 @@ def damped(t, since):
     ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
     ("PULSE(0 2 1 0.5 0.25 2)", lambda t: np.interp(t, [1, 1.5, 3.5, 3.75], [0, 2, 2, 0])),
+    ("DC 0 AC 1 SIN(0 1 1)", lambda t: np.sin(2 * np.pi * t)),
+    ("AC {1} 0 DC 5", lambda t: 5 + 0 * t),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
 ])
 def test_sources_are_those_of_spice(source, expected):
