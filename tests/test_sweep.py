@@ -158,6 +158,22 @@ def test_what_a_launcher_refuses_is_no_launcher_that_gave_up(tmp_path):
         _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
 
 
+def test_why_a_launcher_gave_up_is_one_line(tmp_path):
+    def launch(batch, initial_job_idx):
+        raise RuntimeError("a worker died.\n\nIts exit code")
+
+    orders = OmegaConf.create({"max_batch_size": None, "fail_fast": False})
+    found = _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
+    assert found == "RuntimeError: a worker died. Its exit code"
+
+
+@pytest.mark.parametrize(("word", "meant"), [("c d", "c d"), ("'c, d'", "c, d"), ("2*t", "2*t")])
+def test_a_value_stands_in_tables_as_it_is_meant(word, meant):
+    (override,) = OverridesParser.create().parse_overrides([f"title={word},e"])
+    first = next(override.sweep_string_iterator())
+    assert _overrides([f"title={first}"]) == {"title": meant}
+
+
 def test_what_keeps_a_job_from_its_record_is_said_of_that_job(tmp_path):
     """A full disk for instance; of jobs that are done nothing is said."""
     returned = [JobReturn(_return_value=0, status=JobStatus.COMPLETED),
