@@ -519,7 +519,7 @@ def test_mistakes_in_netlists(lines, message):
     ("v(q)", None, "there is no node q"), ("i(C1)", None, "whose current"),
     ("sqrt(2)", None, "cannot measure"), (None, "R1", "it is no source"),
     ("y=1e*v(a)", None, "cannot measure 'y=1e*v(a)'"), ("v(0)", None, "ground has no voltage"),
-    (None, "V1", "varies with time"),
+    (None, "V1", "V1 is '0.0 + 1.0*sin(2*pi*1.0*t)', and an unknown is a constant"),
 ])
 def test_mistakes_in_what_is_asked(measure, unknown, message):
     text = "t\nV1 a 0 SIN(0 1 1)\nR1 a b 1\nC1 b 0 1\n"
