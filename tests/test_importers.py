@@ -338,6 +338,13 @@ def test_a_circuit_starts_from_what_is_said_of_it():
     }
 
 
+def test_a_capacitor_that_is_not_at_ground_starts_as_is_said_of_it():
+    """0.7 V on 1 F, which two resistors of 1 ohm and a source of 5 V discharge to -5 V."""
+    plant = plant_of("t\nV1 a 0 5\nR1 a m 1\nC1 n m 1 ic=0.7\nR2 n 0 1\n", measure="v(n,m)")
+    result = run(plant, observer="none", time={"horizon": 2.0, "samples": 21})
+    np.testing.assert_allclose(result.outputs["y_n"], 5.7 * np.exp(-result.t / 2) - 5, atol=1e-11)
+
+
 def test_outputs_have_names_units_and_rows():
     plant = plant_of(
         "t\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n",
