@@ -170,5 +170,8 @@ def test_error_norms_are_of_theta(tmp_path):
     assert np.linalg.norm(errors[:, -1], axis=1).min() > 2 * theta[:, -1].max()
     (panel,) = describe(result.details, ["error_norms"])["error_norms"][:1]
     np.testing.assert_allclose([curve.y for curve in panel.curves], theta, rtol=1e-9)
+    (final, *_), x = describe(result.details, ["gains"])["gains"], result.details.signals.states
+    size = np.linalg.norm(result.details.estimation.true_parameters[:, :2], axis=1).max()
+    assert final.size == pytest.approx(max(size, np.linalg.norm(x, axis=1).max()))
     read = read_errors(read_run("a", tmp_path / "a", {}))
     np.testing.assert_allclose([each.parameters for each in read], theta, rtol=1e-9)

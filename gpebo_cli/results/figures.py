@@ -232,7 +232,8 @@ def gains(result: RunResult) -> list[Panel]:
         times = Panel("time to ±2σ", (curve(SETTLED, "all", 2),), "s", axis=axis)
     ever = any(np.isfinite(each.y).any() for each in times.curves)
     truth, seen = estimation.true_parameters, _seen(estimation, _known(result))
-    of_eta = truth[:, ~np.isnan(truth).any(axis=0)]
+    judged = judged_of(result.system, len(estimation.names))
+    of_eta = truth[:, judged & ~np.isnan(truth).any(axis=0)]
     size = max(largest(of_eta), largest(result.signals.states[:, seen]))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
     return _with_legend([
