@@ -120,7 +120,7 @@ NETLISTS = {  # name: (netlist, what is measured, index)
         "R2 c 0 1\nC2 c 0 1 ic=0\nH1 d 0 Vs 1.5\nR3 d e 1\nC3 e 0 1 ic=0\n"), "v(c),v(e)", 1,
     ),
     "subcircuits": (
-        ("sub\n.param rr=2\n.subckt filt in out r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c}\n"
+        ("sub\n.param rr=2\n.subckt filt in out PARAMS: r=1 c=1\nR1 in out {r*rr}\nC1 out 0 {c}\n"
         ".ic v(out)=0.4\n.ends\nV1 in 0 SIN(0 1 0.3)\nX1 in m filt r=0.5\n"
         "X2 m o filt c=0.3\n"), "v(o)", 1,
     ),
@@ -273,6 +273,8 @@ def damped(t, since):
     ("PULSE(1 3 0.5 0.25 0.5 0.75 2 2)", lambda t: np.interp(
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
     ("PULSE(0 2 1 0.5 0.25 2)", lambda t: np.interp(t, [1, 1.5, 3.5, 3.75], [0, 2, 2, 0])),
+    ("DC 0 AC 1 SIN(0 1 1)", lambda t: np.sin(2 * np.pi * t)),
+    ("AC {1} 0 DC 5", lambda t: 5 + 0 * t),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
 ])
 def test_sources_are_those_of_spice(source, expected):
@@ -334,6 +336,13 @@ def test_a_circuit_starts_from_what_is_said_of_it():
     assert plant_of(text)["initial_state"] == {
         "a": 3, "b": 2, "c": 0, "ir1": 0.5, "ir3": -1.5, "il1": 0.5, "il2": 0.25
     }
+
+
+def test_a_capacitor_that_is_not_at_ground_starts_as_is_said_of_it():
+    """0.7 V on 1 F, which two resistors of 1 ohm and a source of 5 V discharge to -5 V."""
+    plant = plant_of("t\nV1 a 0 5\nR1 a m 1\nC1 n m 1 ic=0.7\nR2 n 0 1\n", measure="v(n,m)")
+    result = run(plant, observer="none", time={"horizon": 2.0, "samples": 21})
+    np.testing.assert_allclose(result.outputs["y_n"], 5.7 * np.exp(-result.t / 2) - 5, atol=1e-11)
 
 
 def test_outputs_have_names_units_and_rows():
@@ -517,7 +526,7 @@ def test_mistakes_in_netlists(lines, message):
     ("v(q)", None, "there is no node q"), ("i(C1)", None, "whose current"),
     ("sqrt(2)", None, "cannot measure"), (None, "R1", "it is no source"),
     ("y=1e*v(a)", None, "cannot measure 'y=1e*v(a)'"), ("v(0)", None, "ground has no voltage"),
-    (None, "V1", "varies with time"),
+    (None, "V1", "V1 is '0.0 + 1.0*sin(2*pi*1.0*t)', and an unknown is a constant"),
 ])
 def test_mistakes_in_what_is_asked(measure, unknown, message):
     text = "t\nV1 a 0 SIN(0 1 1)\nR1 a b 1\nC1 b 0 1\n"
@@ -896,7 +905,7 @@ def test_text_of_a_linear_model_with_mistakes(matrix, message, tmp_path):
 
 def test_files_that_are_no_models(tmp_path):
     for name, text, message in (
-        ("m.txt", "", "m.txt: expected a .mat, .npz, .py, .m or .jl file, or a folder of .mtx"),
+        ("m.txt", "", "m.txt: expected a netlist .*, a mechanism"),
         ("m.py", "B = [[1]]\n", r"m.py has no line A = \[...\]"),
         ("m.m", "A = [1];\nx0 = [a];\n", "m.m: x0: 'a' is not a number"),
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import sys
 import tomllib
@@ -68,7 +69,14 @@ def test_a_recipe_runs_and_is_drawn(tmp_path):
     path = tmp_path / "experiment" / "two_gains.yaml"
     path.write_text(path.read_text().replace("horizon: 20, samples: 1001", "horizon: 2"))
     printed(gpebo("figures", "two_gains", "--config-dir", ".", "--output", "drawn", cwd=tmp_path))
-    assert "fast and slow gains" in (tmp_path / "drawn" / "index.html").read_text()
+    page = (tmp_path / "drawn" / "index.html").read_text()
+    assert "fast and slow gains" in page
+    assert "paper’s figures" not in page
+    assert "Ortega" not in page
+    sweep = re.sub("^# (?=hydra:|  )", "", path.read_text(), flags=re.MULTILINE)
+    path.with_stem("sweep").write_text(sweep)
+    words = ["run", "--config-dir", ".", "experiment=sweep", "--dry-run"]
+    assert "4 jobs; nothing was run" in gpebo(*words, cwd=tmp_path).stdout
     assert not list((tmp_path / "drawn").rglob("*circuit*"))  # that is the paper's
     wrong = gpebo("figures", "two_gain", "--config-dir", ".", cwd=tmp_path)
     assert "did you mean two_gains?" in wrong.stderr

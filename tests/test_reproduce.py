@@ -41,6 +41,9 @@ def test_the_page_is_that_of_the_recipes():
     assert "**off**" not in page
     assert page.count("**erratum**") == 2
     for name in NAMES:
+        recipe = yaml.safe_load((ROOT / "experiments" / "published" / f"{name}.yaml").read_text())
+        for entry in recipe["expected"]:
+            assert f" | {float(entry['tolerance']):.1g} | {entry['where']} |\n" in page, name
         picture = f"img/atlas/{name}.png"
         assert f"({picture})" in page
         assert (ROOT / "docs" / picture).stat().st_size < 40_000

@@ -129,6 +129,7 @@ def test_words_of_a_sweep_are_refused_without_one(tmp_path, word):
         (["hydra.sweep.subdir=x"], "the folders of jobs are numbered"),
         (["estimator=drem,dremm"], "estimator=dremm: there is no such estimator"),
         (["estimator.gama=1,2"], "estimator.gama: no such key"),
+        (["experiment=gain_sweep,gain_multirun"], "experiment=gain_multirun: a sweep is"),
         (["hydra/launcher=joblibb"], "there is no such hydra/launcher; known: basic"),
     ],
 )
@@ -155,6 +156,22 @@ def test_what_a_launcher_refuses_is_no_launcher_that_gave_up(tmp_path):
     orders = OmegaConf.create({"max_batch_size": None, "fail_fast": False})
     with pytest.raises(ConfigError, match="n=1"):
         _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
+
+
+def test_why_a_launcher_gave_up_is_one_line(tmp_path):
+    def launch(batch, initial_job_idx):
+        raise RuntimeError("a worker died.\n\nIts exit code")
+
+    orders = OmegaConf.create({"max_batch_size": None, "fail_fast": False})
+    found = _launch([["n=1"]], [0], tmp_path, orders, SimpleNamespace(launch=launch), {})
+    assert found == "RuntimeError: a worker died. Its exit code"
+
+
+@pytest.mark.parametrize(("word", "meant"), [("c d", "c d"), ("'c, d'", "c, d"), ("2*t", "2*t")])
+def test_a_value_stands_in_tables_as_it_is_meant(word, meant):
+    (override,) = OverridesParser.create().parse_overrides([f"title={word},e"])
+    first = next(override.sweep_string_iterator())
+    assert _overrides([f"title={first}"]) == {"title": meant}
 
 
 def test_what_keeps_a_job_from_its_record_is_said_of_that_job(tmp_path):

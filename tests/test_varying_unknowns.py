@@ -8,12 +8,14 @@ from plants import left_of_identities, observed, seen, shipped
 from scipy.integrate import solve_ivp
 from units import Units, in_units
 
+from gpebo_cli import run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.functions import system_from_functions
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.observers import observe
 from gpebo_cli.results.figures import describe, parameters
+from gpebo_cli.results.finished import read_errors, read_run
 from gpebo_cli.results.summary import estimates_at_end
 from gpebo_cli.settings import Settings, SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -156,3 +158,20 @@ def test_a_function_of_the_wrong_shape_is_refused():
     )
     with pytest.raises(ConfigError, match="theta returned shape"):
         simulate(system, TimeSettings(horizon=1.0), SOLVER)
+
+
+def test_error_norms_are_of_theta(tmp_path):
+    """e₀ makes up for what varies, of any size: curves count θ, as the metrics do."""
+    system = shipped("descriptor", unknowns=STEP)
+    result = run(system, estimator="ls_drem", gamma=[1, 2, 3], time={"horizon": 4, "samples": 41})
+    result.save(tmp_path / "a", figures=False)
+    errors = result.details.estimation.parameters - result.details.estimation.true_parameters
+    theta = np.linalg.norm(errors[:, :, :2], axis=2)
+    assert np.linalg.norm(errors[:, -1], axis=1).min() > 2 * theta[:, -1].max()
+    (panel,) = describe(result.details, ["error_norms"])["error_norms"][:1]
+    np.testing.assert_allclose([curve.y for curve in panel.curves], theta, rtol=1e-9)
+    (final, *_), x = describe(result.details, ["gains"])["gains"], result.details.signals.states
+    size = np.linalg.norm(result.details.estimation.true_parameters[:, :2], axis=1).max()
+    assert final.size == pytest.approx(max(size, np.linalg.norm(x, axis=1).max()))
+    read = read_errors(read_run("a", tmp_path / "a", {}))
+    np.testing.assert_allclose([each.parameters for each in read], theta, rtol=1e-9)

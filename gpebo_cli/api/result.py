@@ -100,12 +100,12 @@ class Result:
 
     @cached_property
     def inputs(self) -> NamedArrays:
-        """Known inputs u by name, (N,) each."""
+        """Inputs u by name, without noise, (N,) each; ``to_pandas`` has them as measured."""
         return NamedArrays("inputs", self.details.system.inputs, self.details.signals.inputs)
 
     @cached_property
     def outputs(self) -> NamedArrays:
-        """Measured outputs y by name, (N,) each."""
+        """Outputs y by name, without noise, (N,) each; ``to_pandas`` has them as measured."""
         return NamedArrays("outputs", self.details.system.outputs, self.details.signals.outputs)
 
     @cached_property
@@ -178,7 +178,7 @@ class Result:
         return self.details.verdict
 
     def __getitem__(self, name: str) -> Array:
-        """A signal by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
+        """A true signal or an estimate by its name in the CSV files: ``t``, ``il``, ``il_hat``."""
         everything = {"t": self.t, **self.inputs, **self.outputs, **self.states}
         if name in everything:
             return everything[name]

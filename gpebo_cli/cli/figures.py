@@ -12,7 +12,7 @@ from gpebo_cli.cli.arguments import NO_WORDS, Arguments
 from gpebo_cli.cli.options import CONFIG_DIR, VOLUME, no_option, parse
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.schema import convert, shown, unknown
+from gpebo_cli.schema import convert, counted, shown, unknown
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
@@ -52,7 +52,7 @@ def main(words: list[str]) -> int:
         section = gallery.write_recipe(folder / recipe.name, recipe, figures, formats)
         sections.append(section)
         if not options.quiet:
-            sys.stdout.write(f"{recipe.name}: {section.pictures} figures\n")
+            sys.stdout.write(f"{recipe.name}: {counted(section.pictures, 'figure')}\n")
         if update is not None:
             gallery.write_references(Path(update), recipe.name, figures)
         if check is not None:

@@ -192,7 +192,7 @@ def _launch(
         except (*LIBRARY_ERRORS, GpeboError):
             raise
         except Exception as error:  # noqa: BLE001  a worker died, a cluster is out of reach
-            return f"{type(error).__name__}: {error}"
+            return " ".join(f"{type(error).__name__}: {error}".split())
         for number, job in zip(numbers, returned, strict=False):
             if job.status == JobStatus.FAILED:  # a full disk for instance
                 raised = job._return_value  # noqa: SLF001  asked for in public, Hydra prints it
@@ -212,8 +212,8 @@ def _overrides(job: Sequence[str]) -> dict[str, str]:
 
 
 def _unquoted(value: str) -> str:
-    """A text as it was written, without the quotes that Hydra's grammar needs around a formula."""
-    if not value.startswith(("'", '"')):
+    """A text as it was meant, without what Hydra's grammar needs: quotes, a backslash at blanks."""
+    if not value.startswith(("'", '"')) and "\\" not in value:
         return value
     parsed = OverridesParser.create().parse_override(f"value={value}").value()
     return parsed if isinstance(parsed, str) else value
@@ -269,7 +269,11 @@ def _compositions(
         )
         if kind not in seen:
             seen.add(kind)
-            yield loader.load_sweep_config(config, list(job))
+            composed = loader.load_sweep_config(config, list(job))
+            if composed.hydra.sweeper.params != config.hydra.sweeper.params:
+                name = composed.hydra.runtime.choices.experiment
+                raise ConfigError(f"experiment={name}: a sweep is no job of another; run it alone")
+            yield composed
 
 
 def _check_folder(folder: Path, plan: Plan, *, resume: bool) -> None:

@@ -385,19 +385,24 @@ class _Builder:
         return column
 
     def _start_of_capacitors(self) -> None:
-        """Node voltages from ``ic=`` of capacitors: those at ground first, then along chains."""
+        """Node voltages from ``ic=`` of capacitors: those at ground first, then along chains.
+
+        Of a chain that is not at ground one end starts at 0: what counts is the difference.
+        """
         voltages = {node: self.netlist.initial.get(f"v({node})") for node in self._node}
-        known = {GROUND: 0.0} | {node: v for node, v in voltages.items() if v is not None}
+        known = {node: v for node, v in voltages.items() if v is not None}
         given = [(e.nodes, e.initial) for e in self.elements.values()
                  if e.kind == "C" and e.initial is not None]
-        before = 0
-        while len(known) > before:
+        for start in (GROUND, *(nodes[1] for nodes, _ in given)):
             before = len(known)
-            for (a, b), across in given:
-                if b in known:
-                    known.setdefault(a, known[b] + across)
-                elif a in known:
-                    known[b] = known[a] - across
+            known.setdefault(start, 0.0)
+            while len(known) > before:
+                before = len(known)
+                for (a, b), across in given:
+                    if b in known:
+                        known.setdefault(a, known[b] + across)
+                    elif a in known:
+                        known[b] = known[a] - across
         for node, label in self._node.items():
             if node in known:
                 self.draft.states[label] = (known[node], "V")

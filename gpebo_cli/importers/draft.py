@@ -103,7 +103,7 @@ class PlantDraft:
             value, unit = self.inputs[name]
             if isinstance(value, str):
                 raise ConfigError(
-                    f"plant {self.name}: {name} varies with time, and an unknown is a constant; "
+                    f"plant {self.name}: {name} is {shown(value)}, and an unknown is a constant; "
                     "give the source one number, or leave it an input"
                 )
             self.unknowns[name] = (value, unit)

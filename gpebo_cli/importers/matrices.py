@@ -130,7 +130,8 @@ def read_matrices(path: Path) -> dict[str, Any]:
     if ending in (".py", ".m", ".jl"):
         return _modelica(path)
     raise ConfigError(
-        f"{path}: expected a .mat, .npz, .py, .m or .jl file, or a folder of .mtx files"
+        f"{path}: expected a netlist (.cir .net .sp .spice .ckt), a mechanism (.yaml), or matrices "
+        "(a .mat, .npz, .py, .m or .jl file, or a folder of .mtx files)"
     )
 
 

@@ -194,14 +194,14 @@ def _tokens(text: str, place: Place) -> list[str]:
 
 
 def _options(text: str, place: Place) -> tuple[list[str], dict[str, str]]:
-    """Plain words, and ``key=value`` pairs by lower-case key."""
+    """Plain words but ``params:``, and ``key=value`` pairs by lower-case key."""
     words, plain, options, k = [*_tokens(text, place), "", ""], list[str](), dict[str, str](), 0
     while key := words[k]:
         equals, value = words[k + 1 : k + 3]
         if key == "=" or (equals == "=" and value in ("", "=")):
             raise place.error("= needs a name before it and a value behind it")
         if equals != "=":
-            plain.append(key)
+            plain += [key] * (key.lower() != "params:")
             k += 1
             continue
         stop = k + 3  # on=1,3,5: more numbers belong to the key
@@ -317,7 +317,6 @@ class Netlist:
 
     def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:
         place = scope.place
-        plain = [word for word in plain if word.lower() != "params:"]
         last = plain[-1] if len(plain) > 1 else ""
         block = self.blocks.get(last.lower())
         if block is None:
@@ -461,9 +460,13 @@ class Netlist:
 
     def _source(self, rest: list[str], scope: _Scope, name: str) -> float | str:
         place = scope.place
-        words = rest[1:] if rest and rest[0].lower() == "dc" else rest
-        # What stands behind AC is for another analysis.
-        words = list(itertools.takewhile(lambda word: word.lower() != "ac", words))
+        # A size and a phase behind AC are for another analysis.
+        at = next((k for k, word in enumerate(rest) if word.lower() == "ac"), len(rest))
+        sizes = itertools.takewhile(
+            lambda word: word.startswith("{") or number(word) is not None, rest[at + 1 : at + 3]
+        )
+        words = rest[:at] + rest[at + 1 + len([*sizes]) :]
+        words = words[1:] if words and words[0].lower() == "dc" else words
         text = " ".join(words)
         shape = re.fullmatch(r"(?is)(?:\S+\s+)?(sin|pulse|pwl|exp)\s*\((.*)\)", text)
         if shape is not None:

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.experiment.accuracy import judged_of
 from gpebo_cli.experiment.result import EstimationResult, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results import style
 from gpebo_cli.results.comparison import norm_panels, words
-from gpebo_cli.results.finished import ErrorCurves, largest, rows_at
+from gpebo_cli.results.finished import INITIAL, ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, symbol, typeset, unit_of
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 FigureFunction = Callable[[RunResult], list[Panel]]
 
 MAX_CASES = 4  # curves of more cases than that do not stay apart
-_INITIAL = "e0_"  # of the names of parameters that stand for an initial state
 MAX_DOTS = 200  # more points than that are a line
 MIN_GAINS = 3  # fewer points are not a curve over the gain
 
@@ -232,7 +232,8 @@ def gains(result: RunResult) -> list[Panel]:
         times = Panel("time to ±2σ", (curve(SETTLED, "all", 2),), "s", axis=axis)
     ever = any(np.isfinite(each.y).any() for each in times.curves)
     truth, seen = estimation.true_parameters, _seen(estimation, _known(result))
-    of_eta = truth[:, ~np.isnan(truth).any(axis=0)]
+    judged = judged_of(result.system, len(estimation.names))
+    of_eta = truth[:, judged & ~np.isnan(truth).any(axis=0)]
     size = max(largest(of_eta), largest(result.signals.states[:, seen]))
     # Seconds on a linear axis: they seldom span a decade, and a decade is all one could label.
     return _with_legend([
@@ -314,7 +315,7 @@ def _of_states(
     def of_part(result: RunResult, estimation: EstimationResult) -> list[Panel]:
         """The states x_a, the states x_b, or all where the parameters do not tell them apart."""
         names = result.system.states
-        a = [i for i, name in enumerate(names) if _INITIAL + name in estimation.names]
+        a = [i for i, name in enumerate(names) if INITIAL + name in estimation.names]
         b = [i for i in range(len(names)) if i not in a]
         members = {"": [] if a else b, "a": a, "b": b if a else []}
         return figure(result, estimation, members[part])
@@ -388,6 +389,7 @@ def _norm_panels(named: Sequence[tuple[str, RunResult, int]]) -> list[Panel]:
             continue
         truth, x = estimation.true_parameters, truth_at(result, estimation.t)
         known, seen = ~np.isnan(truth).any(axis=0), _seen(estimation, _known(result))
+        known &= judged_of(result.system, len(estimation.names))
         labels.append(label)
         curves.append(ErrorCurves.of(
             estimation.t, (estimation.parameters[case] - truth)[:, known],

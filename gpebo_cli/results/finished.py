@@ -23,6 +23,7 @@ from gpebo_cli.results.sweep_folder import PLAN, JobRecord, read_plan, read_reco
 from gpebo_cli.schema import shown
 
 _NUMBER = re.compile(r"-?(?:[0-9]+(?:\.[0-9]+)?(?:e[+-]?[0-9]+)?)")
+INITIAL = "e0_"  # of the names of parameters that stand for an initial state
 _MOST_BYTES = 200_000_000  # of a file; as cells they take eight times as many
 
 
@@ -186,6 +187,8 @@ def _read_errors(folder: Path) -> Callable[[int], ErrorCurves]:
     path = folder / "estimates.csv"
     everything = read_columns(path, "case", "t", present=[f"{name}_hat" for name in known])
     signals = read_columns(folder / "signals.csv", "t")
+    if any(f"{name}_true" in everything for name in known):  # θ varies, and e0 makes up for it
+        known = {name: value for name, value in known.items() if not name.startswith(INITIAL)}
 
     def of_case(number: int) -> ErrorCurves:
         """Its error norms (GpeboError: there is no such case)."""

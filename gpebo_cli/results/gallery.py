@@ -153,9 +153,11 @@ def page(sections: Sequence[Section], made_by: Provenance) -> str:
         f'<li><a href="#{s.name}"><code>{s.name}</code></a>: {s.title}</li>\n'
         for s in sections
     )
+    papers = {section.name for section in sections} & {*STUDIES}  # and not of one's own alone
     text = html.paragraph(
-        "Ortega, Bobtsov, Castaños, Nikolaev, arXiv:2407.14373. Everything here was computed and "
-        "drawn by gpebo figures. Beside every picture is a CSV file with exactly what is drawn."
+        "Ortega, Bobtsov, Castaños, Nikolaev, arXiv:2407.14373. " * bool(papers) + "Everything "
+        "here was computed and drawn by gpebo figures. Beside every picture is a CSV file with "
+        "exactly what is drawn."
     )
     body = "".join(
         f'<section id="{s.name}">\n<h2>{s.title}</h2>\n'
@@ -163,7 +165,7 @@ def page(sections: Sequence[Section], made_by: Provenance) -> str:
         for s in sections
     )
     nav = f"<nav><ul>\n{contents}</ul></nav>\n"
-    title = "The paper’s figures, regenerated"
+    title = "The paper’s figures, regenerated" if papers else "Figures of recipes"
     return html.document(title, text + nav + body + html.footer(made_by), embedded=False)
 
 
