@@ -94,7 +94,8 @@ def _march(
         whole = min(int(np.append(kept != np.arange(K), True).argmax()), len(before[2]) - 1)
         values[:whole], frames = before[0][:whole], before[2][: whole + 1]
         pieces.append([extra[:whole] for extra in before[1]])
-    for first in range(whole, K, count := max(_POINTS // points, 1)):
+    count = max(_POINTS // points, 1)
+    for first in range(whole, K, count):  # the extras are wanted of all, solved or not
         t, inside = (x[first : first + count] for x in (mesh.points, mesh.inside))
         c = problem.coefficients(t.ravel(), inside.ravel())
         signals = [at_points(x, len(t), points - 1) for x in (c.A, c.f, *c.extras)]
