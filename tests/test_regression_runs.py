@@ -43,6 +43,8 @@ def test_it_stands_in_place_of_a_plant_and_an_observer(tmp_path):
         assert_refused(done, f"{word}: regression=NAME stands in place of")
     done = gpebo("run", "regression=filtered", "regression.S=[a]", cwd=tmp_path)
     assert_refused(done, "regression.S: no such key", "'+regression.S=VALUE' adds it")
+    done = gpebo("run", "plant=circuit", "regression.Y=1", cwd=tmp_path)
+    assert_refused(done, "regression.Y: no regression is chosen; regression=NAME does")
     assert "adds it" not in gpebo("run", "plant.S=1", cwd=tmp_path).stderr  # a plant has no such
     done = gpebo("run", "observer=regression", cwd=tmp_path)
     assert_refused(done, "observer=regression goes with regression=NAME")

@@ -116,6 +116,8 @@ def _unknown_key(key: str, cause: BaseException | None, arguments: Arguments) ->
     missing = key.removeprefix(path).lstrip(".").partition(".")[0]
     if any(word.lstrip("+~").startswith("regression.") for word in arguments.given.words):
         path = re.sub("^plant", "regression", path)  # as which it is stored
+        if path == "regression" and "psi" not in parent:
+            return f"{key.replace('plant', path, 1)}: no regression is chosen; regression=NAME does"
     missing = missing or str(getattr(cause, "key", ""))  # of a mapping that was given as a whole
     full = f"{path}.{missing}" if path else missing
     if not known:
