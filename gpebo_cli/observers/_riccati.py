@@ -54,8 +54,8 @@ _MANY, _FEW = 500, 6  # elements, short by the samples that end them; the stages
 _SLOW = 0.3  # if the logarithm of X₁ grows by no more in any of them
 _ROOM = 8  # times as many elements may be needed with few stages
 _SETTLED = 1e2  # the same at first, where P has settled: elements are to resolve it, too
-# Elements for X₁, for each one of the mesh as it is, from which on P itself costs no more, or
-_STIFF = 4  # 1 + (n/8)³ times as many.
+# Elements for X₁, for each one of the mesh as it is, from which on P itself costs no more: this,
+_STIFF = 4  # times 1 + (n/8)³, because P has n² entries.
 _GROWTH = 1e3  # of X₁ within an element, at most: as many digits of P are lost
 
 
@@ -225,7 +225,7 @@ def run_filter(
         if stiff:  # a P that is singular, and grows fast, may be beyond Newton's method
             with suppress(SolverError, np.linalg.LinAlgError):
                 solved = _with_error(of_covariance, *asked)
-        found, extras, error_estimate = solved or _with_error(of_pairs, *asked)
+        found, extras, error_estimate = solved or _with_error(_of_pairs, *asked)
         mesh, (P, estimate) = found.mesh, quotient(found.values)
     except np.linalg.LinAlgError as error:
         raise SolverError(f"the Riccati equation of the {name} has no finite solution") from error
@@ -317,7 +317,7 @@ def _deviations(P: Array) -> Array:
     return np.asarray(np.maximum(d, least))
 
 
-def of_pairs(
+def _of_pairs(
     problem: LinearProblem, mesh: Mesh, tol: float, max_elements: int
 ) -> tuple[Trajectory, tuple[Array, ...]]:
     """The solution of the linear equation and the extras, as ``of_covariance`` gives them."""

@@ -154,10 +154,10 @@ def page(sections: Sequence[Section], made_by: Provenance) -> str:
         for s in sections
     )
     papers = {section.name for section in sections} & {*STUDIES}  # and not of one's own alone
+    authors = "Ortega, Bobtsov, Castaños, Nikolaev, arXiv:2407.14373. " if papers else ""
     text = html.paragraph(
-        "Ortega, Bobtsov, Castaños, Nikolaev, arXiv:2407.14373. " * bool(papers) + "Everything "
-        "here was computed and drawn by gpebo figures. Beside every picture is a CSV file with "
-        "exactly what is drawn."
+        f"{authors}Everything here was computed and drawn by gpebo figures. Beside every picture "
+        "is a CSV file with exactly what is drawn."
     )
     body = "".join(
         f'<section id="{s.name}">\n<h2>{s.title}</h2>\n'
