@@ -24,8 +24,8 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.observers import SignalNoise, kalman_bucy, observe
+from gpebo_cli.observers._filter_model import NoiseModel, filter_model
 from gpebo_cli.observers._riccati import run_filter
-from gpebo_cli.observers.kalman_bucy import NoiseModel, filter_model
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
