@@ -58,7 +58,7 @@ class Source:
     recording: RecordingResult | None = None
     rows: Rows | None = None  # of a recording
     samples: Array | None = None  # (N,) of one recording: the times of its rows with an output
-    pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
+    pieces: tuple[Source, ...] = ()  # several recordings, each with its own times and signals
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
     @property
