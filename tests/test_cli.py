@@ -183,6 +183,7 @@ WRONG = [
     (["run", "observer.regression=papr"], "did you mean paper?"),
     (["run", "figures=regressor"], "did you mean figures=[regressor]?"),
     (["run", "figures=[nope]"], "nope"),
+    (["run", "+output.figures=all"], "output.figures: no such key; did you mean figures?"),
     (["run", "figures.width=wide"], "figures.width: expected column or page"),
     (["run", "figures.dpi=9"], "figures.dpi: expected 30 to 1200"),
     (["run", "figures.fromats=[png]"], "figures.fromats: no such key; figures has formats, width"),

@@ -356,6 +356,11 @@ def test_outputs_have_names_units_and_rows():
     assert plant["C"] == [[1, 0, 0, 0], [1, -1, 0, 0], [0, 0, 1, -2], [1, 0, 1, 0], [0, -3, 0, 0]]
 
 
+def test_numbers_in_names_are_ordered_as_numbers():
+    plant = plant_of("t\nV1 n1 0 1\nR1 n1 n10 1\nR2 n10 n2 1\nC10 n10 0 1\nC2 n2 0 1\n")
+    assert plant["states"] == ["n1", "n2", "n10", "iv1"]
+
+
 def test_comments_of_equations_stand_in_one_column():
     for matrix in from_netlist(PAPER).to_yaml().split("\n\n")[1:]:
         rows = [line for line in matrix.splitlines() if line.startswith("  - [")]

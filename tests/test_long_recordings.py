@@ -363,8 +363,14 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
     files = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
     for file in files:
         np.savetxt(file, table, delimiter=",", header="t,current,v", comments="")
-    with pytest.raises(ConfigError, match="1025 samples would take some"):
-        run("battery", data={"file": files})
+    # Each is there beside the other, and none beside itself.
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 0.002)
+    needs = []
+    for file in files[0], files:
+        with pytest.raises(ConfigError, match="1025 samples would take some") as refusal:
+            run("battery", data={"file": file})
+        needs.append(float(str(refusal.value).partition("some ")[2].split()[0]))
+    assert needs[1] == pytest.approx(2.0 * needs[0], rel=0.01)
     # Those that go on from window to window are there each by itself and, wider, all together; in
     # current coordinates there are dynamics beside the regression.
     monkeypatch.setattr(gpebo, "_LONG", 32)

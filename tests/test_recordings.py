@@ -32,7 +32,7 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.guess import _factor, guess
-from gpebo_cli.recordings.hold import edges, held, recording_mesh
+from gpebo_cli.recordings.hold import bends, edges, held, recording_mesh
 from gpebo_cli.recordings.lines import DATE, LineReader, seconds
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import read_table
@@ -221,8 +221,13 @@ def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
         if hold == "zoh" else np.interp(at, t, values[:, 0])
     )
     np.testing.assert_allclose(trajectory(at)[:, 0], expected, atol=1e-13)
-    bends = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
-    assert set(bends) <= set(mesh.edges.tolist())
+    corners = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
+    assert set(corners) <= set(mesh.edges.tolist())
+
+
+def test_rows_that_are_close_do_not_bend_a_line_by_rounding():
+    t = np.cumsum(np.tile([1.0, 1e-6], 20))
+    assert not bends(t, np.pi * t[:, None], "linear").any()
 
 
 STEPPED = {
@@ -319,6 +324,7 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
     path.write_text(text)
     with refused(str(path), *parts) as error:
         read(path)
+    assert ("with a gap" in str(error.value)) == (mistake == "nan")
     if parts[0].startswith("line"):  # a stream, whose length nobody knows, says the same
         assert streamed(path, text.encode())[1] == str(error.value)
 
