@@ -722,6 +722,8 @@ def test_what_is_required_is_told_with_the_numbers_of_its_evidence(name, gains, 
             assert product == pytest.approx(min(gains["gamma"]) * whole)
             assert found.gain == pytest.approx(needed / whole)
             assert found.text.endswith("" if found.holds else f": γ ≥ {needed / whole:.2g}")
+    elif name == "ls_drem":  # without a gain
+        assert "∫Δ²/T" in found.text
 
 
 @pytest.mark.parametrize(("gamma", "first", "segment"), [
