@@ -1002,6 +1002,18 @@ def test_without_gains_there_are_no_units(name, observer):
     np.testing.assert_allclose(one.estimates["a"][0, -1], 2.0, rtol=2e-3 if observer else 1e-9)
 
 
+def test_what_is_rounding_in_Y_is_no_estimate():
+    """A parameter that is zero, in a tiny unit, and two whose columns differ by a millionth."""
+    small = regression(lambda t: three(t) * [1.0, 1.0, 1e-9], np.array([1.5, -0.7, 0.0]))
+    (found,) = run("ls_drem", small, f0=None)
+    np.testing.assert_allclose(found[-1, :2], [1.5, -0.7], rtol=1e-9)
+    assert not found[:, 2].any()
+    alike = regression(lambda t: np.stack(
+        [np.sin(t) + 1.5, np.sin(t) + 1.5 + 1e-6 * np.cos(3 * t)], axis=-1
+    ), np.array([1.5, -0.7]))
+    assert not run("ls_drem", alike, f0=None).any()
+
+
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])
 def test_estimates_that_are_not_what_the_data_say_are_told(observer):
     """From 1e5, e^-6 of which is left: 1 % of the start, as was required, and far from the truth.

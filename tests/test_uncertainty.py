@@ -80,8 +80,11 @@ def test_the_mean_of_white_samples(rows, step):
     np.testing.assert_allclose(of_x[:, 0], 2.0 * expected, rtol=1e-9)
 
 
-def test_where_rounding_decides_at_the_start_the_first_row_alone_says_nothing():
+@pytest.mark.parametrize("chunk", [1 << 22, 1])
+def test_where_rounding_decides_at_the_start_the_first_row_alone_says_nothing(chunk, monkeypatch):
     """Though C is a number before the second row comes."""
+    monkeypatch.setattr(uncertainty, "_CHUNK", chunk)
+
     def mean(t, inside):
         made = summing(0.0)(t, inside)
         return made._replace(C=np.where(inside[:, None, None] < 0.01, np.nan, made.C))
