@@ -412,6 +412,16 @@ def test_a_plant_of_ones_own(tmp_path, mine):
     assert folders(tmp_path)[0].name.endswith("_mine_ls_drem")
 
 
+def test_a_recipe_may_say_where_its_own_values_stand(tmp_path, mine):
+    (mine / "experiment").mkdir(exist_ok=True)
+    (mine / "experiment" / "both.yaml").write_text(
+        "# @package _global_\ndefaults: [{override /plant: mine}, _self_]\ntitle: both\n"
+    )
+    words = "--config-dir", mine, "experiment=both", "--cfg", "job"
+    said = yaml.safe_load(printed(gpebo("run", *words, cwd=tmp_path)))
+    assert (said["plant"]["name"], said["title"]) == ("mine", "both")
+
+
 def test_an_error_in_a_plant_names_its_file(tmp_path, mine):
     (mine / "plant" / "bad.yaml").write_text(MINE.replace("A: [[-1]]", "A: [[-z]]"))
     done = gpebo("run", "--config-dir", mine, "plant=bad", *FAST, cwd=tmp_path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -562,7 +563,8 @@ def test_dates_are_seconds_after_the_first(tmp_path):
 def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
     rows = {"t": [0.0, 0.5, 1.0], "V": [1.0, 2.0, 4.0], "y": [3.0, 5.0, 6.0]}
     frame = pd.DataFrame(rows)
-    savemat(tmp_path / "r.mat", {**rows, "note": "text", "single": 3.0})
+    pages = np.zeros((3, 2, 2))
+    savemat(tmp_path / "r.mat", {**rows, "note": "text", "single": 3.0, "pages": pages})
     since = pd.to_timedelta(frame["t"], unit="s")
     dated = frame.set_index(pd.Timestamp("2024-01-01") + since).drop(columns="t")
     frames = frame, frame.set_index("t"), frame.assign(t=since), dated
@@ -1281,6 +1283,11 @@ def test_errors_on_lines_have_the_steps_on_both_sides():
 def test_a_folder_and_too_many_cells_are_no_recording(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="is a folder, not a file"):
         run("circuit", data=tmp_path)
+    (tmp_path / "b.parquet").write_bytes(b"PAR1")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pyarrow.parquet", None)
+        with refused("b.parquet needs pyarrow: pip install 'gpebo[parquet]'"):
+            run("circuit", data=tmp_path / "b.parquet")
     if not find_spec("pyarrow"):
         return
     frame = pd.DataFrame(stepped())

@@ -190,7 +190,7 @@ def _grid(settings: Settings, samples: Sampling | None, start: float, stop: floa
 
 def sample_times(step: float, start: float, stop: float) -> Array:
     """start, start + T, … up to stop, (K,) (ConfigError)."""
-    rounding = SNAP * max(abs(start), abs(stop))
+    rounding = SNAP * abs(stop)
     count = int(np.floor(((stop - start) * (1.0 + _ROUNDING) + rounding) / step))
     if count < 1:
         raise ConfigError(
