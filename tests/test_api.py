@@ -338,6 +338,8 @@ WRONG = [
     ({"remedy": "reset"}, 'did you mean observer={"remedy": …}?'),
     ({"estimtor": "drem"}, "did you mean estimator?"),
     ({"estimator": "drm"}, "estimator=drm: there is no such estimator"),
+    ({"estimator": "mystery"}, "(yours: config_dir=DIR with DIR/estimator/mystery.yaml)"),
+    ({"estimator": "./drem.yaml"}, "estimator=./drem.yaml: there is no such estimator; known: "),
     ({"estimator": {"name": "drem", "gama": 1}}, "estimator.gama: no such key"),
     ({"plant": "circut"}, "did you mean circuit?"),
     ({"plant": "nowhere.yaml"}, "nowhere.yaml: there is no such file"),

@@ -12,7 +12,7 @@ from plants import one_state, reference, shipped
 from processes import printed
 from scipy.integrate import quad
 
-from gpebo_cli import run
+from gpebo_cli import check, run
 from gpebo_cli.experiment.assumptions import examine, warnings
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
@@ -259,6 +259,18 @@ def test_a_state_that_no_equation_sees_is_none_in_other_coordinates_either(seed,
     )
     names = {a.name: a for a in examine(settings, plant_from_mapping(plant, "mixed")).assumptions}
     assert names["Assumption 1"].holds == bool(seen)
+
+
+def test_of_a_recording_what_the_observer_needs_is_named_and_without_one_there_is_nothing():
+    """z' (t − 1/2) = −z: in the middle E has no rank."""
+    t = np.linspace(0.0, 1.0, 21)
+    plant = one_state(states=["x", "z"], E=[[1, 0], [0, "t - 1/2"]], A=[[-1, 0], [0, -1]],
+                      C=[[1, 1]], initial_state=[1, 0])
+    data = {"t": t, "y": np.exp(-t)}
+    (failed,) = check(plant, data=data)
+    assert (failed.name, failed.holds) == ("Rank of E", False)
+    assert "from 2 at t = 0 to 1 at t = 0.5" in failed.evidence["found"]
+    assert check(plant, data=data, observer="none") == ()
 
 
 def evidence(plant, **time):

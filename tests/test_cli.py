@@ -183,6 +183,7 @@ WRONG = [
     (["run", "observer.regression=papr"], "did you mean paper?"),
     (["run", "figures=regressor"], "did you mean figures=[regressor]?"),
     (["run", "figures=[nope]"], "nope"),
+    (["run", "+output.figures=all"], "output.figures: no such key; did you mean figures?"),
     (["run", "figures.width=wide"], "figures.width: expected column or page"),
     (["run", "figures.dpi=9"], "figures.dpi: expected 30 to 1200"),
     (["run", "figures.fromats=[png]"], "figures.fromats: no such key; figures has formats, width"),
@@ -409,6 +410,16 @@ def test_simulate_only(tmp_path):
 def test_a_plant_of_ones_own(tmp_path, mine):
     printed(gpebo("run", "--config-dir", mine, "plant=mine", *FAST, cwd=tmp_path))
     assert folders(tmp_path)[0].name.endswith("_mine_ls_drem")
+
+
+def test_a_recipe_may_say_where_its_own_values_stand(tmp_path, mine):
+    (mine / "experiment").mkdir(exist_ok=True)
+    (mine / "experiment" / "both.yaml").write_text(
+        "# @package _global_\ndefaults: [{override /plant: mine}, _self_]\ntitle: both\n"
+    )
+    words = "--config-dir", mine, "experiment=both", "--cfg", "job"
+    said = yaml.safe_load(printed(gpebo("run", *words, cwd=tmp_path)))
+    assert (said["plant"]["name"], said["title"]) == ("mine", "both")
 
 
 def test_an_error_in_a_plant_names_its_file(tmp_path, mine):

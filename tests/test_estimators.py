@@ -722,6 +722,8 @@ def test_what_is_required_is_told_with_the_numbers_of_its_evidence(name, gains, 
             assert product == pytest.approx(min(gains["gamma"]) * whole)
             assert found.gain == pytest.approx(needed / whole)
             assert found.text.endswith("" if found.holds else f": γ ≥ {needed / whole:.2g}")
+    elif name == "ls_drem":  # without a gain
+        assert "∫Δ²/T" in found.text
 
 
 @pytest.mark.parametrize(("gamma", "first", "segment"), [
@@ -998,6 +1000,18 @@ def test_without_gains_there_are_no_units(name, observer):
     assert other.details.estimation.requirement.holds
     np.testing.assert_allclose(other.estimates["a"], one.estimates["a"], rtol=1e-9)
     np.testing.assert_allclose(one.estimates["a"][0, -1], 2.0, rtol=2e-3 if observer else 1e-9)
+
+
+def test_what_is_rounding_in_Y_is_no_estimate():
+    """A parameter that is zero, in a tiny unit, and two whose columns differ by a millionth."""
+    small = regression(lambda t: three(t) * [1.0, 1.0, 1e-9], np.array([1.5, -0.7, 0.0]))
+    (found,) = run("ls_drem", small, f0=None)
+    np.testing.assert_allclose(found[-1, :2], [1.5, -0.7], rtol=1e-9)
+    assert not found[:, 2].any()
+    alike = regression(lambda t: np.stack(
+        [np.sin(t) + 1.5, np.sin(t) + 1.5 + 1e-6 * np.cos(3 * t)], axis=-1
+    ), np.array([1.5, -0.7]))
+    assert not run("ls_drem", alike, f0=None).any()
 
 
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])

@@ -264,6 +264,8 @@ def damped(t, since):
     ("SIN(0.5 2 0.4)", lambda t: 0.5 + 2 * np.sin(0.8 * np.pi * t)),
     ("SIN(0.5 2 0.4 1 0.2 30)", lambda t: damped(t, 1)),
     ("SIN(0.5 2 0.4 0 0.2 30)", lambda t: damped(t, 0)),
+    ("SIN(0.5 2 0.4 4 300)", lambda t: 0.5 + 2 * np.exp(-300 * (t - 4).clip(0))
+     * np.sin(0.8 * np.pi * (t - 4).clip(0))),
     ("EXP(1 3 0.5 0.7 2 0.3)", lambda t: 1 + 2 * -np.expm1(-(t - 0.5).clip(0) / 0.7)
      - 2 * -np.expm1(-(t - 2).clip(0) / 0.3)),
     ("PWL(0.5 1 1 3 1 -1 2 4)", lambda t: np.interp(
@@ -354,6 +356,17 @@ def test_outputs_have_names_units_and_rows():
     assert plant["outputs"] == ["y_a", "y_a_", "s", "y", "y_b"]
     assert [plant["units"].get(name) for name in plant["outputs"]] == ["V", "V", "A", None, "V"]
     assert plant["C"] == [[1, 0, 0, 0], [1, -1, 0, 0], [0, 0, 1, -2], [1, 0, 1, 0], [0, -3, 0, 0]]
+
+
+def test_numbers_in_names_are_ordered_as_numbers():
+    plant = plant_of("t\nV1 n1 0 1\nR1 n1 n10 1\nR2 n10 n2 1\nC10 n10 0 1\nC2 n2 0 1\n")
+    assert plant["states"] == ["n1", "n2", "n10", "iv1"]
+
+
+def test_what_is_constant_has_no_derivative_and_a_resistor_may_start_from_nothing():
+    plant = plant_of("t\nV1 a 0 1\nL1 a b 1u\nR1 b 0 {t}\n", measure="i(R1),i(L1)")
+    assert "d(" not in str(plant["A"])
+    assert plant["initial_state"].get("ir1", 0) == 0
 
 
 def test_comments_of_equations_stand_in_one_column():
@@ -473,6 +486,7 @@ def test_what_continues_and_what_is_a_comment():
     ("R1 a 0 1\nR1 a 0 2", "line 3: R1 stands in line 2 already"),
     ("D1 a 0 mod", "elements are R, L, C"),
     ("X1 a 0 filter", "ends with the name of a subcircuit, and 'filter' is none"),
+    ("X1", "X1 ends with the name of a subcircuit, and nothing is none"),
     (".subckt filter a\nR1 a 0 1\n.ends\nX1 a filtre", "'filtre' is none; did you mean filter?"),
     ("T1 a 0 b 0 z0=50 td=1n", "T is an ideal transformer with n=RATIO"),
     (".include /etc/passwd\nR1 a 0 1", "would read another file"),

@@ -179,6 +179,15 @@ def test_what_is_left_of_a_state_has_no_unit_and_no_sign(kernel, growth):
     np.testing.assert_array_equal(
         other.resolved(h * of_eta, offset * of_states, turned, growth), found
     )
+    if growth:  # what grew may be all that is left, whatever is beside it
+        units = np.where(np.arange(80) == 1, 1e-6, 1.0)
+        np.testing.assert_array_equal(known.resolved(h, offset, gain, growth, units), found)
+
+
+def test_a_state_that_nothing_is_known_of_is_not_told_by_parameters_that_are():
+    known = knowledge(np.eye(2)[None], np.ones(2), np.ones(1))
+    gain = np.array([[[1.0, 0.0], [np.nan, np.nan], [0.0, 0.0]]])
+    assert known.states(gain).tolist() == [[True, False, True]]
 
 
 def test_rounding_of_Y_is_larger_in_what_is_told_less():

@@ -34,6 +34,7 @@ from gpebo_cli.regression.estimator import Lasting, Unmixed
 from gpebo_cli.regression.resets import ExtensionState
 from gpebo_cli.settings import ExcitationSettings, SolverSettings
 from tests.plants import one_state, shipped
+from tests.processes import write_table
 from tests.regressions import ETA, regression, three
 
 STEP = {  # its A jumps, between samples and away from wanted times
@@ -363,8 +364,14 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
     files = [str(tmp_path / name) for name in ("a.csv", "b.csv")]
     for file in files:
         np.savetxt(file, table, delimiter=",", header="t,current,v", comments="")
-    with pytest.raises(ConfigError, match="1025 samples would take some"):
-        run("battery", data={"file": files})
+    # Each is there beside the other, and none beside itself.
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 0.002)
+    needs = []
+    for file in files[0], files:
+        with pytest.raises(ConfigError, match="1025 samples would take some") as refusal:
+            run("battery", data={"file": file})
+        needs.append(float(str(refusal.value).partition("some ")[2].split()[0]))
+    assert needs[1] == pytest.approx(2.0 * needs[0], rel=0.01)
     # Those that go on from window to window are there each by itself and, wider, all together; in
     # current coordinates there are dynamics beside the regression.
     monkeypatch.setattr(gpebo, "_LONG", 32)
@@ -379,6 +386,20 @@ def test_what_is_made_of_a_recording_is_forecast(monkeypatch, tmp_path):
             run("battery", data={"file": some}, time={"samples": 41})
         sizes.append(float(str(told.value).split("some ")[1].split(" GB")[0]))
     assert 4.0 < sizes[1] / sizes[0] < 8.0
+
+
+def test_the_residual_of_two_long_files_is_that_of_their_rows(tmp_path):
+    """Least squares of y = e^-t x(0) + e by NumPy, of each file by itself."""
+    t, noise, files, left = np.linspace(0.0, 5.0, 401), np.random.default_rng(0), [], []
+    for k in range(2):
+        y = 3.0 * np.exp(-t) + 0.1 * noise.standard_normal(401)
+        files.append(write_table(tmp_path / f"{k}.csv", {"t": t, "y": y}))
+        psi = np.exp(-t[:, None])
+        left.append(y - psi @ np.linalg.lstsq(psi, y)[0])
+    plant = one_state(A=[[-1]])
+    for data in files[:1], files:
+        found = run(plant, data=data, estimator="least_squares", time={"samples": 5}).details.fit
+        assert found.residual == pytest.approx([np.std(left[: len(data)])], rel=0.01)
 
 
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():

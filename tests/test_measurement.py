@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import shipped
+from plants import one_state, shipped
 from processes import assert_refused, printed
 from scipy.integrate import solve_ivp
 from test_cli import folders
@@ -25,6 +25,7 @@ from gpebo_cli.experiment.noise import (
     sampled_mesh,
 )
 from gpebo_cli.experiment.pipeline import run_experiment
+from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
@@ -169,6 +170,16 @@ def test_quantisation_rounds_what_is_sampled():
     _, noisy = seen(shipped("descriptor"), quantisation=0.25, sample_time=0.1, outputs=0.5)
     steps = noisy.outputs(t) / 0.25
     assert steps == pytest.approx(np.rint(steps), abs=1e-9)
+
+
+def test_what_has_no_name_in_a_mapping_of_levels_has_no_noise():
+    plant = plant_from_mapping(one_state(
+        inputs={"u": 1, "v": 1}, B=[[1, 1]], outputs=["y", "z"], C=[[1], [2]]
+    ))
+    levels = noise_levels(NoiseSettings(outputs={"y": 1}, inputs={"v": 2}, quantisation={"z": 3}),
+                          plant)
+    found = levels.outputs.tolist(), levels.inputs.tolist(), levels.steps.tolist()
+    assert found == ([1, 0], [0, 2], [0, 3])
 
 
 # The band -----------------------------------------------------------------------------------

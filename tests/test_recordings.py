@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import sys
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,7 +33,7 @@ from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.recordings.guess import _factor, guess
-from gpebo_cli.recordings.hold import edges, held, recording_mesh
+from gpebo_cli.recordings.hold import bends, edges, held, recording_mesh
 from gpebo_cli.recordings.lines import DATE, LineReader, seconds
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import read_table
@@ -221,8 +222,13 @@ def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
         if hold == "zoh" else np.interp(at, t, values[:, 0])
     )
     np.testing.assert_allclose(trajectory(at)[:, 0], expected, atol=1e-13)
-    bends = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
-    assert set(bends) <= set(mesh.edges.tolist())
+    corners = {"zoh": [0.5, 1.7], "linear": [0.3, 0.5, 1.7, 2.0]}[hold]
+    assert set(corners) <= set(mesh.edges.tolist())
+
+
+def test_rows_that_are_close_do_not_bend_a_line_by_rounding():
+    t = np.cumsum(np.tile([1.0, 1e-6], 20))
+    assert not bends(t, np.pi * t[:, None], "linear").any()
 
 
 STEPPED = {
@@ -319,6 +325,7 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
     path.write_text(text)
     with refused(str(path), *parts) as error:
         read(path)
+    assert ("with a gap" in str(error.value)) == (mistake == "nan")
     if parts[0].startswith("line"):  # a stream, whose length nobody knows, says the same
         assert streamed(path, text.encode())[1] == str(error.value)
 
@@ -556,7 +563,8 @@ def test_dates_are_seconds_after_the_first(tmp_path):
 def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
     rows = {"t": [0.0, 0.5, 1.0], "V": [1.0, 2.0, 4.0], "y": [3.0, 5.0, 6.0]}
     frame = pd.DataFrame(rows)
-    savemat(tmp_path / "r.mat", {**rows, "note": "text", "single": 3.0})
+    pages = np.zeros((3, 2, 2))
+    savemat(tmp_path / "r.mat", {**rows, "note": "text", "single": 3.0, "pages": pages})
     since = pd.to_timedelta(frame["t"], unit="s")
     dated = frame.set_index(pd.Timestamp("2024-01-01") + since).drop(columns="t")
     frames = frame, frame.set_index("t"), frame.assign(t=since), dated
@@ -1275,6 +1283,11 @@ def test_errors_on_lines_have_the_steps_on_both_sides():
 def test_a_folder_and_too_many_cells_are_no_recording(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match="is a folder, not a file"):
         run("circuit", data=tmp_path)
+    (tmp_path / "b.parquet").write_bytes(b"PAR1")
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pyarrow.parquet", None)
+        with refused("b.parquet needs pyarrow: pip install 'gpebo[parquet]'"):
+            run("circuit", data=tmp_path / "b.parquet")
     if not find_spec("pyarrow"):
         return
     frame = pd.DataFrame(stepped())

@@ -183,7 +183,7 @@ def test_noise_of_a_signal_in_psi_has_no_deviation_to_state(inputs, stated):
     assert (found.details.estimation.parameters_std is not None) == stated
 
 
-def test_arrays_by_name_and_what_can_be_checked():
+def test_arrays_by_name_and_what_can_be_checked(tmp_path):
     t = np.linspace(0.0, 10.0, 1001)
     measured = {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]}
     arrays = {"t": t, "s": np.sin(t), "y": 2 * np.sin(t) - 1}
@@ -192,6 +192,11 @@ def test_arrays_by_name_and_what_can_be_checked():
     assert all(a.holds for a in check(regression=measured, data=arrays))
     constant = {**SINE, "signals": {"s": "1"}, "psi": [["s", 1]]}
     assert [a.name for a in check(regression=constant) if not a.holds] == ["Assumption 2"]
+    files = [write_table(tmp_path / f"{k}.csv", arrays) for k in range(2)]
+    both = run(regression=measured, data=files, estimator="least_squares", f0=None)
+    assert both.parameters["a"] == pytest.approx(2.0, abs=1e-9)
+    with pytest.raises(ConfigError, match="a regression stands in place of a plant and an observ"):
+        run(regression=measured, data=arrays, observer="gpebo")
     with pytest.raises(ConfigError, match=r"s is null, a column of a recording; give data\.file"):
         run(regression=measured)
     with pytest.raises(ConfigError, match=r"t \(1001,\), s \(1001,\), y \(7,\)"):

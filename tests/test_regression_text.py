@@ -289,6 +289,14 @@ def test_what_comes_later_changes_no_estimate_of_the_past(estimator):
     assert np.abs(past).max() < 2.1
 
 
+def test_no_operator_is_larger_than_its_terms():
+    """Right behind a step from 1 to −1 a high pass is −2 λ."""
+    found = on_mesh({"unknowns": {"a": 1.0}, "signals": {"u": "1 - 2*step(t - 5)"}, "Y": ["u"],
+                     "psi": [["hp(u, 3)"]]})
+    assert np.abs(found.psi.values).max() == pytest.approx(6.0, rel=1e-5)
+    assert (np.abs(found.psi.values) <= found.scale[:, None, None]).all()
+
+
 def test_terms_are_those_of_all_elements_piece_by_piece(monkeypatch):
     given = {"unknowns": {"a": 1.0, "b": 2.0}, "signals": {"u": "exp(-t)*sin(9*t)"},
              "Y": ["u"], "psi": [["hp(u, 3) + 1e-3", "integral(lp(u, 2))"]]}

@@ -927,7 +927,7 @@ def test_a_delay_is_the_same_number_of_samples_whenever_the_clock_began(name):
         .recursive(["a", "b", "c"])
         .update(replace(block, t=np.round(start + 0.1 * np.arange(60), 6)))
         .parameters
-        for start in (0.0, 3.7, 1e4)
+        for start in (0.0, 3.7, 1e4, -1e3)
     ]
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], rtol=1e-6, atol=1e-9)

@@ -80,8 +80,11 @@ def test_the_mean_of_white_samples(rows, step):
     np.testing.assert_allclose(of_x[:, 0], 2.0 * expected, rtol=1e-9)
 
 
-def test_where_rounding_decides_at_the_start_the_first_row_alone_says_nothing():
+@pytest.mark.parametrize("chunk", [1 << 22, 1])
+def test_where_rounding_decides_at_the_start_the_first_row_alone_says_nothing(chunk, monkeypatch):
     """Though C is a number before the second row comes."""
+    monkeypatch.setattr(uncertainty, "_CHUNK", chunk)
+
     def mean(t, inside):
         made = summing(0.0)(t, inside)
         return made._replace(C=np.where(inside[:, None, None] < 0.01, np.nan, made.C))
@@ -262,6 +265,27 @@ def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, mo
     known[:, 2] &= "remedy" not in more  # e₀ since a reset is about an estimate
     std = np.nan_to_num(std[known])  # of what no row has moved
     np.testing.assert_allclose(std, np.linalg.norm(each, axis=0)[known], rtol=1e-3)
+
+
+def test_what_errors_of_an_input_did_before_a_reset_stays_in_the_estimate():
+    """Of each row by itself; e₀ since a reset is about an estimate."""
+    plant = one_state(inputs={"u": 0}, unknowns={"k": 1}, A=[[-1]], B=[[1]], F=[[-1]])
+    t = np.array([0.0, 0.7, 1.5, 3.0])
+
+    def found(error):
+        of = run(
+            plant, data={"t": t, "u": 1.0 + np.sin(t) + error, "y": np.cos(2 * t)},
+            noise={"name": "gaussian", "outputs": 0, "inputs": 0.3},
+            estimator={"name": "gradient", "gamma": 2},
+            observer={"name": "gpebo", "remedy": "reset", "reset_times": [1.2]},
+            time={"samples": 4}, solver={"tol": 1e-8},
+        ).details.estimation
+        return (np.stack([of.parameters[0, 2:, 0], of.states[0, 2:, 0]]),
+                np.stack([of.parameters_std[0, 2:, 0], of.states_std[0, 2:, 0]]))
+
+    base, std = found(0.0)
+    each = [found(error)[0] - base for error in 0.3 * np.eye(4)]
+    np.testing.assert_allclose(std, np.linalg.norm(each, axis=0), rtol=1e-9)
 
 
 def test_the_level_of_a_recording_with_a_pause_has_no_bias(tmp_path):

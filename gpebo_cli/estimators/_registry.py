@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 import numpy as np
 
@@ -30,7 +30,7 @@ def build(settings: Mapping[str, object]) -> Estimator:
         ConfigError: unknown name or key, with the nearest known one.
     """
     several = {key: value for key, value in settings.items() if _is_axis(value)}
-    hints: dict[str, Any] = get_type_hints(_ESTIMATORS.find(settings)) if several else {}
+    hints = get_type_hints(_ESTIMATORS.find(settings))
     chosen = combinations({
         key: axis(value, f"estimator.{key}", "finite") for key, value in several.items()
         if hints.get(key) in (float, int)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -25,7 +24,6 @@ _LEFT = float(np.exp(-DECAY))  # of the initial error
 _MAX_ELEMENTS = 200_000
 _TOLERANCE = 1e-11
 _ANY = 1e200  # size of a signal that need not be resolved
-_ROUNDING = 1e-13  # smaller steps between elements are no jumps
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +47,7 @@ class VectorLaw:
         Eliminating it puts γ MᵀN into the matrix, whose rounding errors then drive the slow
         directions: at γ = 1e14 they would be lost. In this form the limit γ → ∞ is an
         ordinary differential-algebraic equation. Where b jumps (a sample, a step of the input), ν
-        does, too, and starts anew; η̂ does not jump. Where M is the identity or diagonal, ν is not
-        needed.
+        does, too, and η̂ does not. Where M is the identity or diagonal, ν is not needed.
         """
         b = with_realisations(self.N.values, self.b.values)
         signals = [self.N.values, b] if self.M is None else [self.M.values, self.N.values, b]
@@ -96,34 +93,15 @@ class VectorLaw:
                 f += gains[:, None] * b
             return LinearEquation(E if residual else None, A, f)
 
-        wide = np.broadcast_to(start.reshape(p, -1), (p, c))
-        starts = _with_residual(packed.values[0, 0], wide) if residual else wide
+        starts = np.zeros((p + k, c))  # of ν any
+        starts[:p] = start.reshape(p, -1)
         problem = LinearProblem(
             coefficients, starts, name="estimator", floor=sizes,
             advice="lower its gain, or use estimator=least_squares",
         )
         return solve(
-            problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS,
-            restarts=_residual_restarts(packed) if residual else {},
+            problem, packed.mesh, tol=_TOLERANCE, max_elements=_MAX_ELEMENTS
         ).trajectory
-
-
-def _residual_restarts(packed: Trajectory) -> dict[float, Callable[[Array], Array]]:
-    """What becomes of (η̂, ν) at the edges where the signals [M ; N ; b] jump."""
-    before, after = packed.values[:-1, -1], packed.values[1:, 0]
-    size = np.abs(packed.values).max(axis=(0, 1))
-    jumps = (np.abs(after - before) > _ROUNDING * size).any(axis=(1, 2))
-    return {
-        float(packed.mesh.edges[k + 1]): partial(_with_residual, after[k])
-        for k in np.flatnonzero(jumps)
-    }
-
-
-def _with_residual(signals: Array, state: Array) -> Array:
-    """(η̂, ν) from η̂ (p, c), or more rows below it, and [M | N | b] (k, 2p + c) at one time."""
-    p = (signals.shape[1] - state.shape[1]) // 2
-    eta, N, b = state[:p], signals[:, p : 2 * p], signals[:, 2 * p :]  # np.split takes far longer
-    return np.concatenate([eta, b - N @ eta])
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,8 +58,6 @@ def joined_source(sources: Sequence[Source]) -> Source:
         sources[0], t=t, recording=recording, derivatives=None, pieces=tuple(sources),
         own_t=together([source.t for source in sources]),
         rows=rows[0]._replace(t=together([each.t for each in rows], shifts)),
-        inputs=_joined([each.inputs for each in sources], shifts),
-        outputs=_joined([each.outputs for each in sources], shifts),
         states=_joined([each.states for each in sources], shifts),
     )
 

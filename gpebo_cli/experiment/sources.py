@@ -58,7 +58,7 @@ class Source:
     recording: RecordingResult | None = None
     rows: Rows | None = None  # of a recording
     samples: Array | None = None  # (N,) of one recording: the times of its rows with an output
-    pieces: tuple[Source, ...] = ()  # several recordings, each at its own times
+    pieces: tuple[Source, ...] = ()  # several recordings, each with its own times and signals
     own_t: Array | None = None  # (N,) the plant's time on the output grid, where that is another
 
     @property
@@ -190,7 +190,7 @@ def _grid(settings: Settings, samples: Sampling | None, start: float, stop: floa
 
 def sample_times(step: float, start: float, stop: float) -> Array:
     """start, start + T, … up to stop, (K,) (ConfigError)."""
-    rounding = SNAP * max(abs(start), abs(stop))
+    rounding = SNAP * abs(stop)
     count = int(np.floor(((stop - start) * (1.0 + _ROUNDING) + rounding) / step))
     if count < 1:
         raise ConfigError(

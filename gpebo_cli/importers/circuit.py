@@ -269,7 +269,7 @@ class _Builder:
 
     def _varies(self, value: Entry) -> bool:
         """Whether a value depends on time, by itself or by way of parameters."""
-        words = set(re.findall(r"[A-Za-z_]\w*", str(value) if isinstance(value, str) else ""))
+        words = set(re.findall(r"\b[A-Za-z_]\w*", str(value)))
         known = self.draft.parameters
         return "t" in words or any(self._varies(known[w]) for w in words & known.keys())
 

@@ -240,8 +240,6 @@ class Netlist:
                 for name, value in given.items():
                     known[name] = self._parameter(scope.prefix + name, value, here)
         for here, line, head in lines:
-            if head.startswith(".param"):
-                continue
             if head.startswith("."):
                 self._command(head, line[len(head) :], here)
                 continue
@@ -313,7 +311,7 @@ class Netlist:
                 f"{head} is not read: elements are linear, R L C K V I E G F H S T X, and "
                 "expressions stand in braces"
             )
-        # Other commands ask for analyses, which gpebo's own settings describe.
+        # .param has been read. Other commands ask for analyses, which gpebo's own settings describe.
 
     def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:
         place = scope.place

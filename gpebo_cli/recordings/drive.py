@@ -77,7 +77,7 @@ def _piecewise(name: str, content: Mapping[str, object], where: str, source: str
     path = beside(given.file, source, f"{where}.file")
     column = given.column or name
     data = DataSettings(
-        name="csv", file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
+        file=path, columns={TIME: given.time, name: column}, scale={name: given.scale},
         **{key: getattr(given, key) for key in keys(TableFormat)},
     )
     alone = DescriptorSystem(  # of which the table is a recording; its matrices are not read

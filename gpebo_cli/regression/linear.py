@@ -188,11 +188,10 @@ class LinearRegression:
         for part in self.gram_parts() if parts is None else parts:
             mesh, (first, last) = part.mesh, part.mesh.span
             some = ((t >= first) | (first == start)) & ((t < last) | (last == stop))
-            if some.any():
-                sampler = mesh.sampler(t[some])
-                found[some], k = sampler(part.values), sampler.element
-                share = (t[some] - mesh.edges[k]) / mesh.steps[k]
-                rounding[some] = interpolation_error(part, k, share)
+            sampler = mesh.sampler(t[some])
+            found[some], k = sampler(part.values), sampler.element
+            share = (t[some] - mesh.edges[k]) / mesh.steps[k]
+            rounding[some] = interpolation_error(part, k, share)
         return found, rounding
 
     def terms(self, t: Array) -> Array:

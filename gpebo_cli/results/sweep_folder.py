@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -91,7 +91,7 @@ def read_record(folder: Path, number: int, overrides: Overrides) -> JobRecord:
         record = None
     if record is None or record.status == "missing" or record.overrides != dict(overrides):
         return JobRecord(number, overrides, "missing")
-    return replace(record, job=number)
+    return record
 
 
 def read_records(folder: Path, plan: Plan) -> list[JobRecord]:
