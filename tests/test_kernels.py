@@ -277,6 +277,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("structure", "reference", _start),
     ("structure", "reference", partial(_start, n=5)),
     ("structure", "reference", partial(_start, n=4, turned=True)),
+    ("structure", "reference", partial(_start, steady=True)),
     ("structure", "levels", _levels),
     ("structure", "levels", partial(_levels, constraints=2, times=2)),
     ("structure", "levels", partial(_levels, steady=True)),
@@ -583,5 +584,14 @@ def test_elimination_fails_where_its_pivots_are_singular_to_rounding(twin, rest)
     assert twin.bounds(M[None], one[None], scale, scale, 1.0, 1, *pivots)[1][0] > 1e-3
     *_, poor = structure_numpy.by_elimination(
         one, M, one, np.ones((1, 3, 1)), *pivots, 1, 3e2, 1e-13
+    )
+    assert poor.all()
+
+
+def test_elimination_that_overflows_fails_and_warns_of_nothing():
+    M, one, order = np.diag([1e-300, 1.0])[None], np.eye(2)[None], np.arange(2)
+    M[0, 1, 0] = 1e10
+    *_, poor = structure_numpy.by_elimination(
+        one, M, one, np.ones((1, 2, 1)), order, order, 1, np.eye(2)[:, :1].copy(), 1, 3e2, 1e-13
     )
     assert poor.all()

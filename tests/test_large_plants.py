@@ -175,6 +175,17 @@ def test_the_structure_alone_is_that_of_the_derivative_array(build):
     assert large.structure_of(plant(build, cells=3), *settings).reference.rank > 0
 
 
+def test_the_least_pivot_is_the_smallest_coefficient_of_what_is_solved_for():
+    """Relative to the largest that it is; of full matrices to the largest singular value."""
+    A = ladder(CELLS)[1].tolist()
+    A[-1][-1] = "-1 - t/8"
+    found = large.structure_of(plant(ladder, A=A), TIME, SolverSettings())
+    assert found.smallest_singular_value == pytest.approx(0.5)
+    full = constant_form(np.array([[2.0, 0.6], [0.6, 2.0]]), -np.eye(2), 5)
+    assert full.pivot == pytest.approx((2.0 - 0.6) / (2.0 + 0.6))
+    assert full.mu == 0
+
+
 def star(cells):
     """One algebraic state that is the sum of all others, and drives them."""
     E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)
