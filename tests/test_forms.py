@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import BOOST, LORENZ, shipped
+from regressions import regression
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 from units import Units, drawn, in_units
@@ -20,7 +22,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import Measurements, gpebo, observe
+from gpebo_cli.observers import AffineStateMap, Measurements, gpebo, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
@@ -520,6 +522,19 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     run(plants.get(of_all, of_all), time={"horizon": 10})
     assert [form for form, _ in asked] == forms
     assert all(elements < 0.1 * SOLVER.max_elements for _, elements in asked)
+
+
+@pytest.mark.parametrize(("part", "told"), [(1.0, (True, 3)), (1e-6, (True, 1))])
+def test_what_was_told_is_told_for_good(part, told):
+    """Two columns of ψ that are apart by ``part`` e^−t, which drowns in e^1.5t; x is their sum."""
+    def psi(t):
+        return np.exp(1.5 * t)[..., None] + part * np.exp(-t)[..., None] * np.arange(2)
+
+    found = regression(psi, np.ones(2))
+    of_state = np.ones((found.mesh.points.size, 1, 2))
+    state_map = AffineStateMap(*map(found.mesh.trajectory, (of_state[:, :, 0], of_state)))
+    observed = SimpleNamespace(regression=found, state_map=state_map, growth=None)
+    assert gpebo._told(observed, SimpleNamespace(q=2, n=1), SOLVER) == told
 
 
 @pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])

@@ -273,6 +273,30 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
     np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
 
 
+def test_a_range_of_E_that_turns_alone_leaves_as_many_coordinates_as_E_has_rank():
+    """Of E = [cos t; sin t] [1 1] the kernel stays."""
+    system = plant_from_mapping({
+        "name": "turning", "states": ["a", "b"], "outputs": ["y"], "initial_state": [0, 0],
+        "E": [["cos(t)", "cos(t)"], ["sin(t)", "sin(t)"]], "A": [[-1, 0], [0, 1]], "C": [[1, 0]],
+    })
+    t = np.linspace(0, 5, 23)
+    split = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10).split
+    np.testing.assert_allclose(np.abs(split.basis), np.full((2, 1), np.sqrt(0.5)), rtol=1e-14)
+
+
+@pytest.mark.parametrize("through", [0, 1])
+def test_an_input_in_an_output_is_in_no_dynamics(through):
+    """x' = −x + z, where 0 = x − 2 z + u and y − D u = z leave z = 0.4 (x + u) + 0.2 (y − D u)."""
+    system = plant_from_mapping({
+        "name": "seen", "states": ["x", "z"], "inputs": {"u": 1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, -2]], "B": [[0], [1]], "C": [[0, 1]],
+        "D": [[through]], "initial_state": [1, 1],
+    })
+    t, form = np.zeros(1), EquationForm(system, Units.plain(system))
+    o = observer_matrices(form, t, t, 1e-10)
+    np.testing.assert_allclose(o.dynamics, [[[-0.6]]], rtol=1e-14)
+
+
 def test_the_weakest_singular_value_is_found_among_bounds_of_it():
     H = np.random.default_rng(0).normal(size=(40, 5, 3))
     H *= np.array([1.0, 1e-3, 1e-3])
