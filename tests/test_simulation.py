@@ -27,7 +27,7 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import known_resolved
 from gpebo_cli.simulation.large import dense_structure
-from gpebo_cli.simulation.simulate import _growth_resolved, simulate
+from gpebo_cli.simulation.simulate import _growth_resolved, _missed, simulate
 
 SOLVER = SolverSettings()
 
@@ -104,7 +104,7 @@ def test_an_explicit_ode_has_index_zero():
 
 
 def test_pivots_of_one_time_may_vanish_at_others():
-    """(max(0, t − 1) + max(0, 3.5 − t)) a' = −a with b = a, of which the second one is the pivot."""
+    """(max(0, t − 1) + max(0, 3.5 − t)) a' = −a, b = a; the second factor of E is the pivot."""
     E = [["max(0, t - 1)", "max(0, 3.5 - t)"], [0, 0]]
 
     def final():
@@ -699,6 +699,22 @@ def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
     with pytest.raises(GpeboError, match=why):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-6])
+def test_how_far_states_miss_constraints_is_seen_at_right_ends(off):
+    """b = sin 5t; half of what it misses that by there reaches a, which has no constraint."""
+    system = plant(
+        states=["a", "b"], inputs={"u": "sin(5*t)"}, E=[[1, 0], [0, 0]], A=[[-1, 0], [0, -1]],
+        B=[[0], [1]], initial_state=[0, 0],
+    )
+    mesh = Mesh(np.linspace(0.0, 1.0, 5), radau_rule(5))
+    values = np.stack([0.0 * mesh.points, np.sin(5.0 * mesh.points)], axis=2)[..., None]
+    values[:, -1, 1] += off
+    structure = dense_structure(system, TimeSettings(horizon=1.0), SOLVER)
+    within = np.array([[0.0, 0.5], [0.0, 0.0]])
+    found = _missed(system, structure, within, mesh, values, np.ones((2, 1)))
+    np.testing.assert_allclose(found, [[0.5 * off], [off]], atol=1e-14)
 
 
 @pytest.mark.parametrize(("rate", "element"), [("500*(t-10)", 0.005), ("20*(t-10)", 0.024)])
