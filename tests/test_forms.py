@@ -538,6 +538,19 @@ def test_what_was_told_is_told_for_good(part, told):
     assert gpebo._told(observed, SimpleNamespace(q=2, n=1), SOLVER) == told
 
 
+@pytest.mark.parametrize(("told", "why"), [
+    ([(True, 1), (True, 2)], "which determines more than the equations as given"),
+    ([(False, 9), (True, 1)], "which tells with more digits what the equations as given tell, or"),
+    ([(True, 2), (True, 2)], ""),
+])
+def test_why_the_other_form_is_taken_is_said(told, why, monkeypatch):
+    monkeypatch.setattr(gpebo, "_same_on_both_forms", lambda *_: False)
+    monkeypatch.setattr(gpebo, "_told", lambda *_: told.pop(0))
+    said = run("descriptor", time={"horizon": 1}).verdict
+    assert why in said
+    assert ("strangeness-free form" in said) == bool(why)
+
+
 @pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])
 def test_with_a_remedy_too_the_other_form_is_taken_where_one_is_not_resolved(monkeypatch, remedy):
     given = gpebo.reduced_system
