@@ -16,7 +16,8 @@ from test_kernels_jets import tape_of, texts
 
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved
+from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved, signal
+from gpebo_cli.model.expressions.intervals import Interval
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -309,6 +310,19 @@ def test_what_has_no_bound_in_a_cell_may_be_finite(text, truth):
     assert integrated(text, horizon=5.03) == pytest.approx(exact, rel=1e-8)
 
 
+@pytest.mark.parametrize("text", ["exp(1000*t)", "log(d(d(1 - t**2)))", "exp(999*d(d(t**2)))"])
+def test_what_has_no_value_for_long_is_refused_in_one_line(text):
+    """Bounds of the last are infinite both; no program is made of it and of the second."""
+    for found in by_both(lambda: one_line(text)):
+        assert f"here = '{text}' has no finite value at t = 0." in found
+
+
+def one_line(text):
+    with pytest.raises(ConfigError) as caught:
+        resolved(Bounds(tape_of(text)), np.linspace(0.0, 5.0, 6))
+    return str(caught.value)
+
+
 def slit(width):
     """A run of q' = −1000 exp(−((y − a)/w)²) q with y' = 0.1: ln q falls by 10⁴ w √π."""
     return run({
@@ -347,6 +361,15 @@ def test_a_pulse_along_an_output_that_is_not_followed_far_enough_is_said(least, 
         monkeypatch.setattr(f"gpebo_cli.{name}", value)
     said = slit(1e-5).verdict
     assert "nothing bounds what functions that change so often do between" in said
+
+
+def test_what_follows_a_signal_is_not_looked_at_without_it():
+    """Nothing bounds sin(y)/y where y = t passes zero, which is no pole."""
+    tape = record([parse("sin(y)/y", {"y": signal("y", 0, "output")}, "here")])
+    bounds = Bounds(tape, lambda low, high: [[Interval(low, high), 1.0]])
+    found, short = resolved(bounds, np.array([-1.0, 0.5, 2.0]), 200)
+    assert not short
+    assert {-1.0, 0.5, 2.0} < set(found)
 
 
 @pytest.mark.parametrize(("w", "power"), [("25*pi", 2000), ("2.5*pi", 20000)])

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
-from gpebo_cli.numerics.errors import EPS, judged_errors, least_sizes
+from gpebo_cli.numerics.errors import CHANCE, EPS, estimated_errors, judged_errors, least_sizes
 from gpebo_cli.numerics.mesh import (
     Looked,
     Mesh,
@@ -697,6 +697,18 @@ def test_rounding_that_constraints_let_through_counts_up_to_what_is_seen_of_it()
     assert least_sizes(problem, own, 1e-14)[1, 0] > 350.0 * EPS / 1e-14
     np.testing.assert_allclose(least_sizes(replace(problem, units=None), own, 1e-6), 3e-3)
     np.testing.assert_allclose(least_sizes(replace(problem, floor=0.1), own, 1e-6), 0.1)
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_rounding_in_one_element_counts_as_if_all_before_had_the_same(constant):
+    """In one of 99 elements that keep everything; up to a chance where its coefficients change."""
+    mesh, one = Mesh(np.arange(100.0), radau_rule(3)), np.ones((99, 1, 1))
+    noise = np.zeros((99, 1, 3))
+    noise[70, 0, 1], noise[:, 0, 0] = 1e-3, 1.0 if constant else np.arange(1.0, 100.0)
+    problem = LinearProblem(None, np.zeros((1, 1)))
+    found = estimated_errors(problem, mesh, one, 0 * one, noise, np.zeros((99, 4, 1, 1)))
+    factor = 10.0 if constant else CHANCE
+    np.testing.assert_allclose(found.last, [[1e-3 * EPS * factor]], rtol=1e-9)
 
 
 def test_errors_of_the_start_are_carried_with_the_solution():

@@ -22,7 +22,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction import strangeness_free as reductions
 from gpebo_cli.reduction.consistency import consistent_state, jumps
 from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of, units_at
-from gpebo_cli.reduction.stages import UnclearError, _Rounding, in_stages
+from gpebo_cli.reduction.stages import UnclearError, _Rounding, _without_dust, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
     _refuse_undetermined,
@@ -436,6 +436,13 @@ def test_singular_values_of_a_stage_are_those_of_its_matrices():
     least = np.linalg.svd(E @ kernel, compute_uv=False)[-1] / np.linalg.norm(E)
     np.testing.assert_allclose(found.smallest, [[0.25, 1.0, least, 0.5]], rtol=1e-12)
     np.testing.assert_allclose(np.abs(found.A2), [[[0.6, 0.0, 0.8]]], atol=1e-15)
+
+
+def test_dust_is_what_is_far_below_the_largest_entry_of_its_matrix():
+    """Singular values of what underflows beside others may have no end."""
+    E = np.array([[[1.0, 1e-280], [-2.0, 0.5]], [[1e-280, -1e-290], [0.0, 1e-285]]])
+    kept = np.array([[[1.0, 0.0], [-2.0, 0.5]], [[1e-280, -1e-290], [0.0, 1e-285]]])
+    np.testing.assert_array_equal(_without_dust(E), kept)
 
 
 def test_how_fast_coefficients_move_is_the_largest_slope_beside_its_size():

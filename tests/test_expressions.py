@@ -547,6 +547,7 @@ def test_bounds_of_waves_and_powers_hold_their_crests_and_poles(function, low, h
     ("t**1", [0], [[0], [1], [0]]),
     ("b**0 + t", [0], [[1], [1]]),  # a name that is folded away is never evaluated
     ("exp(-1000*t**2)", [0, 3], [[1, 0], [0, 0]]),  # underflow is zero
+    ("asin(tanh(40*sign(t - 2)))", [0, 3], [[-np.pi / 2, np.pi / 2], [0, 0]]),  # no 0/0
 ])
 def test_values_and_derivatives_are_exact(text: str, t: list[float], want: list[Any]) -> None:
     found = derivatives(text, [float(time) for time in t], len(want) - 1, a="3/2", b="1/t")
@@ -621,7 +622,8 @@ INSIDE = "step(t) + step(t - 1) + step(t - 2) + step(t + 1) + abs(t - 5)"
      (0, 10), [0.1, 1 / 3, 2.0, 7.0], 0.0),
     # They lie strictly inside.
     ([INSIDE], (0, 2), [1.0], 0.0), ([INSIDE], (1, 1), [], 0.0),
-    (["abs(sin(pi*t))"], (0, 1), [], 0.0), (["sin(t)", "2"], (0, 10), [], 0.0),
+    (["abs(sin(pi*t))"], (0, 1), [], 0.0), (["abs(sin(t))"], (1, 1), [], 0.0),
+    (["sin(t)", "2"], (0, 10), [], 0.0),
     ([], (0, 10), [], 0.0),
     # They are found, on the grid of the search, too.
     (["abs(sin(t)) + sign(2*sin(t))*exp(t)"], (0.5, 10), np.pi * np.arange(1, 4), 1e-15),
@@ -669,6 +671,7 @@ def test_a_part_of_a_tape_keeps_what_switches_in_it():
     whole = record(nodes)
     for place, node in zip(whole.outputs, nodes, strict=True):
         part, alone = whole.of([place]), record([node])
+        np.testing.assert_array_equal(*(breakpoints(tape, 0.0, 7.0) for tape in (part, alone)))
         assert len(part.switches) == len(alone.switches)
         assert sorted(i.operation for i in part.instructions) == sorted(
             i.operation for i in alone.instructions

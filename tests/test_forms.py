@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import BOOST, LORENZ, shipped
+from regressions import regression
 from scipy.integrate import solve_ivp
 from test_observer import ROTATING
 from units import Units, drawn, in_units
@@ -20,7 +22,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import Measurements, gpebo, observe
+from gpebo_cli.observers import AffineStateMap, Measurements, gpebo, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
 from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
@@ -375,7 +377,7 @@ def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
     assert list(found.derivatives) == derivatives
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("known", [None, False, True])
 def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differentiated(known):
     """Tanks whose leak an input sets: the derivative of the other one is in a hidden constraint."""
     system = plant_from_mapping({
@@ -386,7 +388,8 @@ def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differen
     })
     t = np.linspace(0.0, 2.0, 17)
     signals = np.stack([2.0 + np.sin(t), np.cos(t), 0.0 * t], axis=1)
-    inputs = InputDerivatives.of_plant(system, np.array([known, True]))
+    which = None if known is None else np.array([known, True])
+    inputs = None if which is None else InputDerivatives.of_plant(system, which)
     given = EquationForm.given(system, inputs, t, signals=signals)
     refused = pytest.raises(ConfigError, match="derivatives of the input u, the equations contain")
     with nullcontext() if known else refused:
@@ -520,6 +523,32 @@ def test_the_other_form_costs_no_more_than_a_few_elements_where_one_will_do(
     run(plants.get(of_all, of_all), time={"horizon": 10})
     assert [form for form, _ in asked] == forms
     assert all(elements < 0.1 * SOLVER.max_elements for _, elements in asked)
+
+
+@pytest.mark.parametrize(("part", "told"), [(1.0, (True, 3)), (1e-6, (True, 1))])
+def test_what_was_told_is_told_for_good(part, told):
+    """Two columns of ψ that are apart by ``part`` e^−t, which drowns in e^1.5t; x is their sum."""
+    def psi(t):
+        return np.exp(1.5 * t)[..., None] + part * np.exp(-t)[..., None] * np.arange(2)
+
+    found = regression(psi, np.ones(2))
+    of_state = np.ones((found.mesh.points.size, 1, 2))
+    state_map = AffineStateMap(*map(found.mesh.trajectory, (of_state[:, :, 0], of_state)))
+    observed = SimpleNamespace(regression=found, state_map=state_map, growth=None)
+    assert gpebo._told(observed, SimpleNamespace(q=2, n=1), SOLVER) == told
+
+
+@pytest.mark.parametrize(("told", "why"), [
+    ([(True, 1), (True, 2)], "which determines more than the equations as given"),
+    ([(False, 9), (True, 1)], "which tells with more digits what the equations as given tell, or"),
+    ([(True, 2), (True, 2)], ""),
+])
+def test_why_the_other_form_is_taken_is_said(told, why, monkeypatch):
+    monkeypatch.setattr(gpebo, "_same_on_both_forms", lambda *_: False)
+    monkeypatch.setattr(gpebo, "_told", lambda *_: told.pop(0))
+    said = run("descriptor", time={"horizon": 1}).verdict
+    assert why in said
+    assert ("strangeness-free form" in said) == bool(why)
 
 
 @pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])

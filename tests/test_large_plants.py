@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tracemalloc
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from gpebo_cli.observers import AffineStateMap
 from gpebo_cli.observers.reduced import extension
 from gpebo_cli.reduction import scaling
 from gpebo_cli.reduction.constant import constant_form
-from gpebo_cli.reduction.explicit import UndecidedError
+from gpebo_cli.reduction.explicit import UndecidedError, _Equations
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import large, simulate
 
@@ -175,6 +176,29 @@ def test_the_structure_alone_is_that_of_the_derivative_array(build):
     assert large.structure_of(plant(build, cells=3), *settings).reference.rank > 0
 
 
+def test_the_least_pivot_is_the_smallest_coefficient_of_what_is_solved_for():
+    """Relative to the largest that it is; of full matrices to the largest singular value."""
+    A = ladder(CELLS)[1].tolist()
+    A[-1][-1] = "-1 - t/8"
+    found = large.structure_of(plant(ladder, A=A), TIME, SolverSettings())
+    assert found.smallest_singular_value == pytest.approx(0.5)
+    full = constant_form(np.array([[2.0, 0.6], [0.6, 2.0]]), -np.eye(2), 5)
+    assert full.pivot == pytest.approx((2.0 - 0.6) / (2.0 + 0.6))
+    assert full.mu == 0
+
+
+def test_what_cancels_now_and_moves_is_not_taken_for_nothing():
+    def added(*more):
+        of_row = {3: np.array([[1.0], [2.0]])}
+        equations = SimpleNamespace(row=lambda _: of_row, where=lambda _: {0}, units=np.ones(4))
+        _Equations.add(equations, 0, np.eye(2, 1), {3: np.array(more)[:, None]}, None)
+        return of_row
+
+    assert not added(-1.0, -2.0)
+    with pytest.raises(UndecidedError):
+        added(-1.0, 5.0)
+
+
 def star(cells):
     """One algebraic state that is the sum of all others, and drives them."""
     E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)
@@ -203,6 +227,12 @@ def test_inputs_may_be_the_same_function():
     one, two = (large.large_simulation(plant(ladder, inputs=count), TIME, SolverSettings())
                 for count in (1, 2))
     np.testing.assert_allclose(two.signals.states.final, one.signals.states.final, atol=1e-12)
+
+
+def test_an_input_that_is_zero_drives_nothing():
+    found, dense = both(plant(ladder, u=0))
+    final = dense.signals.states.final
+    np.testing.assert_allclose(found.signals.states.final, final, atol=1e-9)
 
 
 def test_a_jump_of_the_input_moves_algebraic_states_only():
@@ -557,7 +587,7 @@ def test_only_unknown_initial_values_are_estimated():
 
 @pytest.mark.parametrize(("observer", "says"), [
     ({"unknown_initial": ["x99"]}, "'x99' is no differential state"),
-    ({"unknown_initial": ["x12"]}, "'x12' is no differential state"),
+    ({"unknown_initial": ["x12"]}, r"'x12' is no differential state; .*: x0, .*, x7, …\)"),
     ({"unknown_initial": ["x1"], "remedy": "reset"}, "accepted remedies"),
     ({"unknown_initial": ["x1"], "sample_time": 0.1}, "continuous time only"),
 ])
@@ -688,11 +718,13 @@ def pulled(cells):
 
 def test_a_start_takes_the_slopes_of_what_moves_in_straight_lines():
     """Both ways, from states that the constraints do not allow."""
-    _, A, _, _ = pulled(CELLS)
-    moving = [[f"{v}*(1 + {0.02 * ((i + j + 1) % 3)}*t)" if v else 0 for j, v in enumerate(row)]
-              for i, row in enumerate(A.tolist())]
+    E, A, _, _ = pulled(CELLS)
+    masses, forces = (
+        [[f"{v}*(1 + {slope * ((i + j + 1) % 3)}*t)" if v else 0 for j, v in enumerate(row)]
+         for i, row in enumerate(matrix.tolist())] for matrix, slope in ((E, 0.1), (A, 0.02))
+    )
     x0 = np.random.default_rng(2).normal(size=len(A))
-    found, dense = both(plant(pulled, u="1 + t", A=moving, initial_state=x0.tolist()))
+    found, dense = both(plant(pulled, u="1 + t", E=masses, A=forces, initial_state=x0.tolist()))
     assert np.abs(found.initial_state - x0).max() > 0.1
     np.testing.assert_allclose(found.initial_state, dense.initial_state, atol=1e-11)
 

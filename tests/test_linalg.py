@@ -18,6 +18,7 @@ from gpebo_cli.numerics.linalg import (
     exact_product,
     inverse_or_none,
     largest_over_time,
+    less_product,
     products_of_others,
     without_rounding,
 )
@@ -127,3 +128,11 @@ def test_what_counts_as_rounding_is_in_proportion_to_the_terms(unit):
     left, right = np.array([[[1.0, 1.0], [1e-3, 0.0]]]), np.array([[[1.0], [-1.0 + 1e-14]]])
     product = exact_product(unit * left, unit * right)
     np.testing.assert_allclose(product, unit**2 * np.array([[[0.0], [1e-3]]]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("one", [1.0, -1.0])
+@pytest.mark.parametrize("other", [1.0, -1.0])
+def test_a_difference_that_is_rounding_is_nothing_whatever_its_signs(one, other):
+    factor, last, own = (np.array([[[x]]]) for x in (3.0 * one, 0.1 * other, 0.3 * one * other))
+    assert own != factor * last
+    assert less_product(own, factor, last) == 0.0

@@ -16,8 +16,8 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
-from gpebo_cli.observers.reduced.matrices import observer_matrices, weakest
-from gpebo_cli.observers.reduced.regression import Assembled
+from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, observer_matrices, weakest
+from gpebo_cli.observers.reduced.regression import Assembled, term_sizes
 from gpebo_cli.observers.reduced.split import axes_frame, constant_split
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -271,6 +271,42 @@ def test_residual_is_a_projector_and_annihilates_the_algebraic_states():
     R, P = o.residual, o.split.projector
     np.testing.assert_allclose(R @ R, R, atol=1e-13)
     np.testing.assert_allclose(R @ o.algebraic @ (np.eye(4) - P), 0, atol=1e-13)
+
+
+def test_a_range_of_E_that_turns_alone_leaves_as_many_coordinates_as_E_has_rank():
+    """Of E = [cos t; sin t] [1 1] the kernel stays."""
+    system = plant_from_mapping({
+        "name": "turning", "states": ["a", "b"], "outputs": ["y"], "initial_state": [0, 0],
+        "E": [["cos(t)", "cos(t)"], ["sin(t)", "sin(t)"]], "A": [[-1, 0], [0, 1]], "C": [[1, 0]],
+    })
+    t = np.linspace(0, 5, 23)
+    split = observer_matrices(EquationForm(system, Units.plain(system)), t, t, 1e-10).split
+    np.testing.assert_allclose(np.abs(split.basis), np.full((2, 1), np.sqrt(0.5)), rtol=1e-14)
+
+
+@pytest.mark.parametrize("through", [0, 1])
+def test_an_input_in_an_output_is_in_no_dynamics(through):
+    """x' = −x + z, where 0 = x − 2 z + u and y − D u = z leave z = 0.4 (x + u) + 0.2 (y − D u)."""
+    system = plant_from_mapping({
+        "name": "seen", "states": ["x", "z"], "inputs": {"u": 1}, "outputs": ["y"],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [1, -2]], "B": [[0], [1]], "C": [[0, 1]],
+        "D": [[through]], "initial_state": [1, 1],
+    })
+    t, form = np.zeros(1), EquationForm(system, Units.plain(system))
+    o = observer_matrices(form, t, t, 1e-10)
+    np.testing.assert_allclose(o.dynamics, [[[-0.6]]], rtol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["on_basis", "G", "range", "elimination"])
+def test_sizes_of_terms_have_no_signs(name):
+    rng = np.random.default_rng(0)
+    z, basis = rng.normal(size=(2, 2, 4)), rng.normal(size=(3, 2))
+    shapes = (2, 4, 2), (2, 4), (2, 4, 1), (2, 4, 2), (2, 3, 2), (2,)
+    equations = AlgebraicEquations(*(rng.normal(size=shape) for shape in shapes))
+    other = equations._replace(**{name: -getattr(equations, name)})
+    one, same = term_sizes(z, basis, equations), term_sizes(-z, -basis, other)
+    np.testing.assert_array_equal(one[0](), same[0]())
+    np.testing.assert_array_equal(one[1], same[1])
 
 
 def test_the_weakest_singular_value_is_found_among_bounds_of_it():

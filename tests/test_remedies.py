@@ -332,12 +332,16 @@ def test_the_regression_holds_in_every_segment(name):
         np.testing.assert_allclose(reset.parameters(before), after, atol=1e-8)
 
 
-def test_a_reset_starts_from_what_all_segments_before_it_have_shown():
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_reset_starts_from_what_all_segments_before_it_have_shown(sign):
     """One of a hundredth of a second shows little: the state is what those before it tell."""
-    system = plant_from_mapping(MIXED)
+    system = plant_from_mapping({
+        **MIXED, "inputs": {"u": f"{sign}*(2 + sin(t))"}, "unknowns": {"theta": 0.7 * sign},
+        "initial_state": [sign, sign, 0.5 * sign],
+    })
     signals, observation = along(system, 20.0, remedy="reset", reset_times=[6.0, 6.01])
     eta = observation.truth(np.array([6.02]), system.theta[None], signals.states)
-    assert eta[0, 0] == 0.7
+    assert eta[0, 0] == 0.7 * sign
     np.testing.assert_allclose(eta[0, 1:], 0.0, atol=1e-7)  # errors of the new start
     for reset in observation.regression.resets:  # what is rounding beside the largest of θ and w
         size = np.abs(np.append(signals.states(np.array([reset.time])), system.theta)).max()
@@ -902,14 +906,14 @@ def test_filters_of_parameters_that_move_are_the_same_in_short_and_in_any_elemen
     ("ls_drem", {"remedy": "reset", "reset_interval": 1.7}),
     ("least_squares", {"remedy": "current_coordinates"}),
 ])  # fmt: skip
-@pytest.mark.parametrize("centre", [1.0, 2.0, 2.5])
+@pytest.mark.parametrize(("centre", "sign"), [(1.0, ""), (2.0, "-"), (2.5, "-")])
 def test_an_unknown_that_does_next_to_nothing_at_the_start_has_no_unit_of_it(
-    estimator, remedy, centre
+    estimator, remedy, centre, sign
 ):
     """F(0) is 1e-44 to 1e-272: that is no unit for what the pulse tells of k, and of the state."""
     plant = {
         "name": "pulse", "states": ["x"], "outputs": ["y"], "unknowns": {"k": 1.5}, "E": [[1]],
-        "A": [[-1]], "F": [[f"exp(-((t - {centre})/0.1)**2)"]], "C": [[1]],
+        "A": [[-1]], "F": [[f"{sign}exp(-((t - {centre})/0.1)**2)"]], "C": [[1]],
         "initial_state": [0.3],
     }
     found = api_run(

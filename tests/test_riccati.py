@@ -20,6 +20,7 @@ from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import (
     Filtered,
     StateSpace,
+    _conditioning,
     _renewed,
     filter_windows,
     pair,
@@ -303,6 +304,26 @@ def test_elements_in_which_conditioning_is_lost_are_cut():
         model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-3, max_elements=1_000
     )
     assert np.abs(found.pair.values[:, :, 0, 0]).max() <= 1e3
+
+
+def test_conditioning_is_lost_in_the_first_element_that_grows_though_others_do_not():
+    X = np.tile(pair(np.eye(2), np.ones((2, 1))), (4, 6, 1, 1))
+    X[2, 3:, 0, 0] = 1e7
+    lost, signal = _conditioning(X, 1e-9)
+    assert lost == 2
+    assert (np.ptp(signal, axis=1) > 0.0).ravel().tolist() == [False, False, True, False]
+
+
+def test_what_follows_the_estimate_is_resolved_too():
+    """cos 50 t, of which elements of a second would see nothing."""
+    case = constant(*(value * np.eye(1) for value in (-1.0, 1.0, 1.0, 1.0, 0.0)))
+    found = run_filter(
+        lambda t, inside: (case.state_space(t), (np.cos(50.0 * t),)), np.zeros((1, 1)), np.eye(1),
+        initial_mesh(0.0, 2.0, [], 2, radau_rule(12)), tol=1e-9, max_elements=1_000,
+        monitor=lambda estimate, extras: [(extras[0][..., None] * np.ones(1), 0.0)],
+    )
+    t = np.linspace(0.0, 2.0, 101)
+    np.testing.assert_allclose(found.extras[0](t), np.cos(50.0 * t), atol=1e-8)
 
 
 def test_a_window_measures_what_is_small_by_what_was_large_before():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from kernel_paths import by_both
 from plants import one_state, reference, shipped
 from processes import refused
 from scipy.integrate import solve_ivp
@@ -26,7 +27,7 @@ from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
 from gpebo_cli.simulation.known import known_resolved
 from gpebo_cli.simulation.large import dense_structure
-from gpebo_cli.simulation.simulate import _growth_resolved, simulate
+from gpebo_cli.simulation.simulate import _growth_resolved, _missed, simulate
 
 SOLVER = SolverSettings()
 
@@ -100,6 +101,31 @@ def test_an_explicit_ode_has_index_zero():
     result = simulate(system, TimeSettings(horizon=2.0), SOLVER)
     assert result.structure.index == 0
     assert result.signals.states(np.array([2.0]))[0, 0] == pytest.approx(0.5, abs=1e-12)
+
+
+def test_pivots_of_one_time_may_vanish_at_others():
+    """(max(0, t − 1) + max(0, 3.5 − t)) a' = −a, b = a; the second factor of E is the pivot."""
+    E = [["max(0, t - 1)", "max(0, 3.5 - t)"], [0, 0]]
+
+    def final():
+        system = plant(states=["a", "b"], E=E, A=[[-1, 0], [1, -1]], initial_state=[1, 1])
+        return simulate(system, TimeSettings(horizon=4.0), SOLVER).signals.states.final
+
+    for found in by_both(final):
+        np.testing.assert_allclose(found, 2.5 / 3.5 * np.exp(-1.0) * 2.5 / 3.0, rtol=1e-9)
+
+
+def test_a_constant_singular_value_that_is_rounding_leaves_a_constraint():
+    """What elimination leaves of E is nothing by its rank: 0 = 2 a − 3 b + u and s = a + b."""
+    system = plant(
+        states=["a", "b"], inputs={"u": "sin(t)"}, E=[[1, 1], [1, 1 + 1e-11]],
+        A=[[-1, 1], [1, -2]], B=[[0], [1]], initial_state=[1, 1],
+    )
+    result, t = simulate(system, TimeSettings(horizon=2.0), SOLVER), np.linspace(0.0, 2.0, 21)
+    found = result.signals.states(t)
+    whole = 2.48 / 1.04 * np.exp(-0.2 * t) + 0.4 * (0.2 * np.sin(t) - np.cos(t)) / 1.04
+    truth = np.stack([(3 * whole - np.sin(t)) / 5, (2 * whole + np.sin(t)) / 5], axis=1)
+    np.testing.assert_allclose(found, truth, rtol=1e-8)
 
 
 @pytest.mark.parametrize("where", [0.3712, 0.5001, 0.50003, 0.7, 0.123456, 0.0011, 0.9989])
@@ -673,6 +699,22 @@ def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
     with pytest.raises(GpeboError, match=why):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))
+
+
+@pytest.mark.parametrize("off", [0.0, 1e-6])
+def test_how_far_states_miss_constraints_is_seen_at_right_ends(off):
+    """b = sin 5t; half of what it misses that by there reaches a, which has no constraint."""
+    system = plant(
+        states=["a", "b"], inputs={"u": "sin(5*t)"}, E=[[1, 0], [0, 0]], A=[[-1, 0], [0, -1]],
+        B=[[0], [1]], initial_state=[0, 0],
+    )
+    mesh = Mesh(np.linspace(0.0, 1.0, 5), radau_rule(5))
+    values = np.stack([0.0 * mesh.points, np.sin(5.0 * mesh.points)], axis=2)[..., None]
+    values[:, -1, 1] += off
+    structure = dense_structure(system, TimeSettings(horizon=1.0), SOLVER)
+    within = np.array([[0.0, 0.5], [0.0, 0.0]])
+    found = _missed(system, structure, within, mesh, values, np.ones((2, 1)))
+    np.testing.assert_allclose(found, [[0.5 * off], [off]], atol=1e-14)
 
 
 @pytest.mark.parametrize(("rate", "element"), [("500*(t-10)", 0.005), ("20*(t-10)", 0.024)])

@@ -23,6 +23,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers._base import Measurements
+from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
 from gpebo_cli.simulation.newton import _ends, _refuse_slow, _window, follow
@@ -321,6 +322,18 @@ def test_signals_are_taken_at_the_time_itself_but_where_something_switches():
     assert (side == np.sign(inside[passed] - linear.switched)).all()
 
 
+def test_the_first_matrices_of_an_observer_are_on_their_side_of_a_switch():
+    """x falls at 1 1/s up to t = ln(5)/4, where the input passes zero."""
+    plant = plant_from_mapping({
+        "name": "relay", "states": ["x"], "inputs": {"u": "exp(4*t) - 5"}, "outputs": ["y"],
+        "E": [[1]], "A": [["-2 - sign(u)"]], "C": [[1]], "initial_state": [1],
+    })
+    found = simulate(plant, TimeSettings(horizon=2.0), SOLVER).signals
+    reduced = reduced_system(plant, Measurements(found.inputs, found.outputs), SOLVER)
+    rates = np.where(reduced.mesh.inside.ravel() < 0.25 * np.log(5.0), -1.0, -3.0)
+    np.testing.assert_array_equal(reduced.first.dynamics[:, 0, 0], rates)
+
+
 def test_a_difference_does_not_pass_a_jump():
     """Beside y = 0 the slope of -|y| x - sign(y)/2 with respect to y is that of one side."""
     plant = plant_from_mapping({
@@ -541,9 +554,9 @@ def test_every_kind_of_error_can_say_where_the_solution_ends():
     """Such as rounding, where two equations contradict each other along an output."""
     system = boost()
     for kind in kinds():
-        found = _ends(system, 0.0, system.initial_state, kind("why"))
+        found = _ends(system, 0.0, -system.initial_state, kind("why"))
         assert type(found) is kind
-        assert str(found).endswith("cannot be followed beyond t = 0 (v = 18 there): why")
+        assert str(found).endswith("cannot be followed beyond t = 0 (v = -18 there): why")
 
 
 def of_motor(t, x):

@@ -123,7 +123,6 @@ class FunctionCoefficients:
         return replace(
             self,
             fixed={**self.fixed, **{name: np.zeros(self.shapes[name]) for name in gone}},
-            functions={k: v for k, v in self.functions.items() if k not in gone},
             signals={k: v for k, v in self.signals.items() if k not in gone},
         )
 

@@ -254,8 +254,8 @@ class Trajectory:
         sampler, signal = self.mesh.sampler(t, inside), self
         found = np.empty((order + 1, len(t), *self.values.shape[2:]))
         for k in range(order + 1):
+            signal = signal.derivative() if k else signal
             found[k] = sampler(signal.values) / factorial(k)
-            signal = signal.derivative() if k < order else signal
         return found
 
     def cells(self, low: Array, high: Array) -> list[list[Interval]]:

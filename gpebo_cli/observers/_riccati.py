@@ -281,7 +281,7 @@ def _scaled(
     """Units (n,) of ζ, a factor of all covariances, and how fast P falls at first, in 1/s."""
     deviation = np.sqrt(np.diag(P0))
     unit = _units(m.A, deviation, horizon, sizes)
-    W = np.abs(transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
+    W = (transpose(m.c) @ np.linalg.solve(m.V, m.c)).max(axis=0)
     # A common factor of all covariances changes nothing. It is chosen so that W is of order 1 over
     # the horizon: entries of 1e7 would be taken as pivots, and mix the equations. A W that moves P
     # by nothing is rounding, and is not made larger.

@@ -365,7 +365,7 @@ def switched(arguments: Tape, t: Array, signals: Callable[[Array, int], Array]) 
     left = np.concatenate([t[k], t[low], turns])
     right = np.concatenate([t[k + 1], turns, t[low + 1]])
     which, index = np.concatenate([i, j, j]), np.arange(len(left))
-    if not 0 < len(left) <= _MOST_SWITCHED:
+    if len(left) > _MOST_SWITCHED:
         return np.zeros(0)
     before = np.concatenate([above[k, i], above[low, j], ~above[low, j]])
     return np.unique(halved(lambda t: at(t, 0)[0][index, which] >= 0.0, before, left, right))

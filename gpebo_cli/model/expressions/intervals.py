@@ -77,10 +77,9 @@ def _product(low: Any, high: Any, least: Any, most: Any) -> tuple[Array, Array]:
     return np.minimum.reduce(ends), np.maximum.reduce(ends)
 
 
-def _quotient(low: Any, high: Any, least: Any, most: Any) -> tuple[Array, Array]:
-    through_zero = (least <= 0) & (most >= 0)
+def _quotient(low: Any, high: Any, least: Any, most: Any) -> Array:
     image = _product(low, high, 1.0 / np.asarray(most), 1.0 / np.asarray(least))
-    return np.where(through_zero, -np.inf, image[0]), np.where(through_zero, np.inf, image[1])
+    return np.where((least <= 0) & (most >= 0), np.nan, image)
 
 
 def _even(function: Callable[[Any], Any], low: Any, high: Any) -> tuple[Array, Array]:
@@ -97,8 +96,7 @@ def _power(low: Any, high: Any, exponent: Any, _: Any) -> Any:
         return np.power(low, r), np.power(high, r)
     if r > 0:
         return np.where(high < 0, np.nan, np.power(np.maximum(low, 0.0), r)), np.power(high, r)
-    image = np.power(high, r), np.power(low, r)
-    return np.where(low > 0, image[0], -np.inf), np.where(low > 0, image[1], np.inf)
+    return np.where(low > 0, (np.power(high, r), np.power(low, r)), np.nan)
 
 
 def _reached(low: Any, high: Any, at: float, period: float) -> Any:
@@ -118,8 +116,7 @@ def _wave(function: np.ufunc, low: Any, high: Any, to: float) -> Any:
 
 
 def _tan(low: Any, high: Any, *_: Any) -> Any:
-    pole = _reached(low, high, _HALF_PI, np.pi)
-    return np.where(pole, -np.inf, np.tan(low)), np.where(pole, np.inf, np.tan(high))
+    return np.where(_reached(low, high, _HALF_PI, np.pi), np.nan, (np.tan(low), np.tan(high)))
 
 
 # Bounds of functions of what is between low and high, and least and most.
