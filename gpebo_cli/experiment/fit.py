@@ -36,7 +36,9 @@ def fit_of(
     about = observation.evidence or observation
     regression = about.regression
     final = estimation.explaining if about is observation else regression.least_squares()[None]
-    if final is None or (about is observation and estimation.names != regression.parameters):
+    if final is None or observation.drifts:
+        return None
+    if about is observation and estimation.names != regression.parameters:
         return None
     duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
 

@@ -326,8 +326,7 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            # A drift of the estimates is no constant that would explain all of the data.
-            evidence=None if model_noise.process.any() else evidence,
+            evidence=evidence, drifts=bool(model_noise.process.any()),
             note=note,
         )
 
