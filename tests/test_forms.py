@@ -453,6 +453,21 @@ def test_a_recorded_input_that_a_hidden_constraint_differentiates_is_named():
     assert "derivatives of" not in found.verdict.replace(told, "")
 
 
+def test_a_recorded_input_in_the_matrices_of_a_hidden_constraint_is_named():
+    """0 = u x - 1 makes z = x' = -u'/u²."""
+    plant = {
+        "name": "follows", "states": ["x", "z", "w"], "inputs": {"u": 1}, "outputs": ["y"],
+        "E": np.diag([1, 0, 1]).tolist(), "A": [[0, 1, 0], ["u", 0, 0], [0, 0, -1]],
+        "phi": [0, -1, 0], "B": [[0]] * 3, "C": [[0, 0, 1]], "initial_state": [0.5, 0, 1],
+    }
+    t = np.linspace(0.0, 3.0, 301)
+    frame = {"t": t, "u": 2 + np.sin(t), "y": np.exp(-t)}
+    found = run(plant, data={"frame": frame, "hold": "cubic"})
+    assert "; derivatives of u are its interpolant's, which amplify its noise" in found.verdict
+    z = -np.cos(t) / (2 + np.sin(t)) ** 2
+    assert abs(found.estimates["z"][0, -1] - z[-1]) < 1e-6
+
+
 def test_a_noisy_input_in_a_hidden_constraint_is_named():
     with pytest.raises(ConfigError, match=r"u4, a hidden constraint on i, is contains .* order 1"):
         observed(CAPACITORS, noisy=("u4",))

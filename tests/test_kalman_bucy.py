@@ -248,6 +248,18 @@ def test_window_is_exciting_but_not_uniformly_observable():
     assert failed == ["uniform observability"]
 
 
+@pytest.mark.parametrize("process", [0.0, 0.1])
+def test_a_measured_state_is_determined_whatever_is_not(process):
+    """x is measured; z, which nothing shows, does not make it unknown."""
+    plant = {
+        "name": "hidden", "states": ["x", "z"], "outputs": ["y"], "E": [[1, 0], [0, 1]],
+        "A": [[-1, 0], [1, 0]], "C": [[1, 0]], "initial_state": {"x": 1, "z": 3},
+    }
+    observer = {"name": "kalman_bucy", "process": process}
+    result = api_run(plant, observer=observer, time={"horizon": 5})
+    assert "not determined by the data: z, e0_z;" in result.verdict
+
+
 def test_uniform_observability_is_measured_by_P0():
     """Of states that stand still the Gramian is ∫CᵀV⁻¹C: one known at the start counts as others.
 

@@ -183,6 +183,18 @@ def test_noise_of_a_signal_in_psi_has_no_deviation_to_state(inputs, stated):
     assert (found.details.estimation.parameters_std is not None) == stated
 
 
+@pytest.mark.parametrize("observer", [None, {"sample_time": 0.1}])
+def test_why_there_is_no_deviation_knows_of_no_matrices(observer):
+    """observer.remedy, which takes noise out of a plant's matrices, is no key of a regression."""
+    t = np.linspace(0.0, 5.0, 51)
+    given = {**SINE, "signals": {"s": None, "y": None}, "Y": ["lp(y, 3)"]}
+    given["psi"] = [["lp(s, 3)", "lp(1, 3)"]]
+    data = {"t": t, "s": np.sin(t), "y": 2 * np.sin(t) - 1}
+    verdict = run(regression=given, data=data, observer=observer).verdict
+    assert "no standard deviations: noise of the signals is in ψ" in verdict
+    assert "remedy" not in verdict
+
+
 def test_arrays_by_name_and_what_can_be_checked(tmp_path):
     t = np.linspace(0.0, 10.0, 1001)
     measured = {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]}

@@ -403,6 +403,28 @@ def test_at_samples_matrices_may_follow_an_input_without_noise():
         fed(system, law, t, u, y, "linear", noisy)
 
 
+@pytest.mark.parametrize("observer", [
+    {"name": "gpebo"}, {"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"},
+])
+def test_what_a_recording_has_of_an_output_that_is_off_tells_no_level(observer):
+    """It is on for 3 of 10 s: what it shows then is all there is, zeros afterwards or not."""
+    t = 0.05 * np.arange(201)
+    noise = 0.05 * np.random.default_rng(1).standard_normal(len(t))
+    y = np.where(t < 2.99, 4.0 - 3.0 * np.exp(-0.1 * t) + noise, 0.0)
+    plant = one_state(unknowns={"b": 0.4}, A=[[-0.1]], F=[[1]], C=[["1 - step(t - 3)"]])
+    found = {
+        horizon: run(
+            plant, data={"frame": {"t": t, "y": y}, "hold": "zoh"}, observer=observer,
+            estimator="least_squares", time={"horizon": horizon},
+        ) for horizon in (3, 10)
+    }
+    short, long = (
+        each.details.estimation.parameters_std[0, -1, 0] for each in found.values()
+    )
+    np.testing.assert_allclose(long, short, rtol=0.02)
+    assert ("white noise" in found[10].verdict) == ("sample_time" not in observer)
+
+
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_the_level_at_samples_has_no_bias(hold):
     """E σ̂² = σ² at every row: the squares of what each error by itself would be taken for."""

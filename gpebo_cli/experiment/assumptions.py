@@ -155,6 +155,7 @@ def visible(
     observation: Observation, t: Array, states: Sequence[str]
 ) -> Callable[[Knowledge], BoolArray]:
     """From what is known at the last M of the times t (N,) to which states are known, (M, n)."""
+    observation = observation.evidence or observation
     state_map = observation.state_map
     if isinstance(state_map, AffineStateMap) and observation.names is None:
         gain, offset, growth = state_map.gain(t), state_map.offset(t), observation.growth

@@ -33,6 +33,7 @@ from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.experiment.uncertainty import (
+    IN_MATRICES,
     none_at_samples,
     residual_ratio,
     sampled_deviations,
@@ -138,7 +139,7 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why),
+        _gains(observation, estimation), _no_deviations(why, system),
     )
 
 
@@ -314,11 +315,13 @@ def at_samples(
     return _completed(
         found, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
-        _no_deviations(why) if source.noisy else _held(samples, metrics),
+        _no_deviations(why, system) if source.noisy else _held(samples, metrics),
     )
 
 
-def _no_deviations(why: str) -> str:
+def _no_deviations(why: str, system: DescriptorSystem) -> str:
+    if system.regression is not None:  # it has no matrices and no remedies
+        why = why.replace(IN_MATRICES, "noise of the signals is in ψ")
     return f"; no standard deviations: {why}" if why else ""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from gpebo_cli.experiment.result import EstimationResult, Fit
 from gpebo_cli.experiment.sources import Source
-from gpebo_cli.model.descriptor import Array, DescriptorSystem
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
 from gpebo_cli.numerics.linalg import reciprocals
 from gpebo_cli.observers import Observation
 
@@ -36,7 +36,9 @@ def fit_of(
     about = observation.evidence or observation
     regression = about.regression
     final = estimation.explaining if about is observation else regression.least_squares()[None]
-    if final is None or (about is observation and estimation.names != regression.parameters):
+    if final is None or observation.drifts:
+        return None
+    if about is observation and estimation.names != regression.parameters:
         return None
     duration = float(regression.mesh.edges[-1] - regression.mesh.edges[0])
 
@@ -101,22 +103,34 @@ def _follows(residual: Array, inputs: Array) -> bool:
 
 def _weighed(columns: Array, residual: Array, y: Array) -> Array:
     """What of columns (N, r, p) fits (N, r) of y best, each output by what is typical of it."""
-    typical = np.median(np.abs(residual), axis=0)
-    weight = reciprocals(typical, typical > _SILENT * np.abs(y).max(axis=0))
+    typical = np.nanmedian(np.abs(residual), axis=0)
+    weight = reciprocals(typical, typical > _SILENT * np.nanmax(np.abs(y), axis=0))
     rows = (columns * weight[:, None]).reshape(-1, columns.shape[2])
     size = np.linalg.norm(rows, axis=0)
     scale = reciprocals(size, size > 0.0)
-    found = np.linalg.lstsq(rows * scale, (residual * weight).ravel(), rcond=None)
+    found = np.linalg.lstsq(rows * scale, np.nan_to_num(residual * weight).ravel(), rcond=None)
     return np.asarray(columns @ (scale * found[0]))
 
 
 def _step(y: Array) -> float:
     """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
     change = np.abs(np.diff(y))
-    change = change[change > _SILENT * np.abs(y).max()]
+    change = change[change > _SILENT * np.nanmax(np.abs(y))]
     step = float(np.median(change)) if len(change) else 0.0
     whole = np.abs(change - step * np.rint(change / step)) < _SILENT**0.5 * step if step else change
     return step if len(change) and whole.mean() >= _ROUNDED else 0.0
+
+
+def _on(system: DescriptorSystem, t: Array, u: Array, y: Array) -> BoolArray:
+    """Which outputs are on at N times, (N or 1, r): rows of C, D and H are not all zero.
+
+    One that never is counts as on, and so do all of a regression.
+    """
+    if system.regression is not None:
+        return np.ones((1, system.r), dtype=bool)
+    c = system.coefficients.taylor(t, 0, signals=np.hstack([u, y])[None])
+    on = c.C[0].any(axis=2) | c.D[0].any(axis=2) | c.H[0].any(axis=2)
+    return np.asarray(on | ~on.any(axis=0))
 
 
 def _explained(
@@ -154,6 +168,7 @@ def _explained(
     if observation.regression.factor is None and not source.pieces:
         u, y = source.inputs(samples), source.outputs(samples)
         t, own_t, fitted = samples, samples, outputs(eta, samples, samples, u, y)
+    y = np.where(_on(system, own_t, u, y), y, np.nan)
     if fitted_again:
         changes = np.diag(np.abs(eta) + (eta == 0.0))  # none is rounding beside η̂
         others = [outputs(eta + change, t, own_t, u, y) for change in changes]
@@ -166,13 +181,13 @@ def _explained(
     step = float(t[-1] - t[0]) / (len(t) - 1)
     stride = 1 if t is samples else max(1, int(np.ceil(apart / step)))
     residual = (y - fitted)[::stride]
-    away = np.abs(residual - residual.mean(axis=0))
-    typical = np.median(away, axis=0) / 0.6745  # σ of normal noise, whatever few do
+    away, off = np.abs(residual - np.nanmean(residual, axis=0)), np.isnan(residual)
+    typical = np.nanmedian(away, axis=0) / 0.6745  # σ of normal noise, whatever few do
     far = (away > _FAR * typical) & (typical > 0.0)
-    residual[far] = 0.0  # and hides nothing of the others
+    residual[far | off] = 0.0  # and hides nothing of the others
     power = (residual**2).sum(axis=0)
     # What an output is used up for leaves rounding, which is no noise.
-    count, seen = len(residual), power > _SILENT**2 * (y[::stride] ** 2).sum(axis=0)
+    count, seen = len(residual), power > _SILENT**2 * np.nansum(y[::stride] ** 2, axis=0)
     lags = range(1, min(_LAGS, count // 4) + 1)
     if not seen.any() or not lags:
         return fit
@@ -195,5 +210,5 @@ def _explained(
             name for name in system.outputs if name in system.followed
         ),
         of_inputs=tuple(compress(system.inputs, source.levels.noisy_inputs)),
-        band=1.96 / np.sqrt(count * seen.sum()),
+        band=1.96 / np.sqrt((~off)[:, seen].sum()),
     )

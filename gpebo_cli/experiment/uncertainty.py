@@ -27,7 +27,7 @@ _ROUNDING = (
     "the estimate"
 )
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
-_IN_MATRICES = (
+IN_MATRICES = (
     "noise of the signals is in the matrices (of outputs observer.remedy=noise_free takes it out) "
     "or differentiated, or this remedy cannot tell what it does"
 )
@@ -64,7 +64,7 @@ def sampled_deviations(
 
 def none_at_samples(cases: int) -> str:
     """Why an observer and an estimator at samples have no deviations."""
-    return _MANY.format(cases) if cases > MOST_CASES else f"{_IN_MATRICES}, or {_NOT_SAID}"
+    return _MANY.format(cases) if cases > MOST_CASES else f"{IN_MATRICES}, or {_NOT_SAID}"
 
 
 def residual_ratio(observation: Observation, source: Source) -> float | None:
@@ -116,7 +116,7 @@ def standard_deviations(
     if not regression.p:
         return ""
     if errors is None or not isinstance(state_map, Differentiable):
-        return _IN_MATRICES
+        return IN_MATRICES
     needed = ResumableEstimator if regression.resets else Affine
     if not isinstance(estimator, Affine) or not isinstance(estimator, needed):
         return _NOT_SAID

@@ -272,6 +272,7 @@ class Observation:
     names: tuple[str, ...] | None = None
     # Whose least squares say what the plant explains, where this observer estimates by itself.
     evidence: Observation | None = None
+    drifts: bool = False  # its estimates are no constants that would explain all of the data
     respond: Response | None = None  # None: the observer cannot tell
     errors: ErrorsAt | None = None  # the same as a linear system; its outputs are δY, δoffset
     growth_rate: float | None = None  # 1/s, ln ‖Φ‖₂ over the horizon

@@ -151,8 +151,7 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            # A drift of the estimates is no constant that would explain all of the data.
-            evidence=None if plant.noise.process.any() else evidence,
+            evidence=evidence, drifts=bool(plant.noise.process.any()),
             note=note,
         )
 

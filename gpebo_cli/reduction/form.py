@@ -117,10 +117,13 @@ class EquationForm:
 
     @property
     def interpolated(self) -> tuple[int, ...]:
-        """Inputs whose derivatives are those of an interpolant."""
+        """Inputs whose derivatives in hidden constraints are those of an interpolant."""
         if self.inputs is None or self.inputs.exact:
             return ()
-        return tuple(sorted({j for _, j in self.derivatives}))
+        used, names = {j for _, j in self.derivatives}, self.system.inputs
+        if self.structure is not None and self.structure.mu:
+            used |= {j for j, name in enumerate(names) if name in self.system.followed}
+        return tuple(sorted(used))
 
     def noise_enters(self, noisy: BoolArray) -> tuple[str, ...]:
         """Which of the ``noisy`` ones of [u; y] (m + r,) have their noise in matrices or slopes."""

@@ -102,22 +102,44 @@ class ObserverMatrices:
         """R = I − 𝒜 Q K, (N, e + r, e + r)."""
         return orthonormal_complement(self.range)
 
-    def errors(self, kept: IntArray | slice, inputs: int) -> ErrorSystem:
+    def _measured(self, *, alone: bool) -> Array:
+        """g_signals without y of outputs that are off: whose rows of C, D and H are zero.
+
+        At each time ``alone``, else at three in a row at least: where C passes zero, Y is smooth.
+        """
+        g, r = self.g_signals, self.outputs
+        off = ~np.logical_or(
+            g[:, -r:, :-r].any(axis=2) | self.algebraic[:, -r:].any(axis=2),
+            self.G[:, -r:].any(axis=2),
+        )
+        if not alone and off.any():
+            three = off[:-2] & off[1:-1] & off[2:]
+            off[:], off[:-2] = False, three
+            off[1:-1] |= three
+            off[2:] |= three
+        if off.any():
+            g = np.array(np.broadcast_to(g, (len(off), *g.shape[1:])))
+            g[:, -r:, -r:][off] = 0.0
+        return g
+
+    def errors(
+        self, kept: IntArray | slice, inputs: int, *, alone: bool = False
+    ) -> ErrorSystem:
         """What errors e of [u; y], m inputs, add to Y (rows ``kept`` (k,)) and to the offset.
 
         ζ' = A_0 ζ + b_0(e),    δY = R (𝒜 ζ + g_y(e)),    δoffset = ζ − K (𝒜 ζ + g_y(e))
         """
         R, H, Q1 = self.residual[:, kept], self.elimination, transpose(self.range)
-        g = self.of_noise(self.g_signals, inputs)
+        g = self.of_noise(self._measured(alone=alone), inputs)
         return ErrorSystem(
             self.dynamics, self.of_noise(self.from_signals, inputs),
             joined(R @ self.on_basis, self.split.basis - H @ (Q1 @ self.on_basis), axis=1),
             joined(R @ g, -H @ (Q1 @ g), axis=1),
         )
 
-    def equations(self, signals: Array) -> AlgebraicEquations:
+    def equations(self, signals: Array, *, alone: bool = False) -> AlgebraicEquations:
         """The algebraic equations with the signals [v; y], (N, v + r, 1)."""
-        g_y = (self.g_signals @ signals)[:, :, 0]
+        g_y = (self._measured(alone=alone) @ signals)[:, :, 0]
         return AlgebraicEquations(
             self.on_basis, g_y, self.G, self.range, self.elimination, self.injectivity
         )

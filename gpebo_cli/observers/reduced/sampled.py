@@ -150,7 +150,7 @@ class SampledObserver(Formulation):
         """Regression and state map from [ξ_a | ξ_b | Φ], z (K, k, ·), and what errors become."""
         system, basis = self.system, self.basis
         o, driving = self._matrices(t, t, signals)
-        equations = o.equations(driving)
+        equations = o.equations(driving, alone=True)
         assembled = regression_signals(z, basis, equations)
         Phi = comparable(np.concatenate([self.start[None], z])[..., 1 + system.q :], self.units)
         growth = float(np.abs(Phi[1:]).max(initial=0.0))
@@ -178,7 +178,9 @@ class SampledObserver(Formulation):
             t, np.diff(t, prepend=last), np.concatenate([previous[None], rows]),
             of_outputs(self.hold, system.m), scale=scale,
         )
-        errors = None if step is None else ErrorSteps.at(step, o.errors(kept, system.m))
+        errors = None if step is None else ErrorSteps.at(
+            step, o.errors(kept, system.m, alone=True)
+        )
         resolve(assembled, slice(None), of_gain(), self.form)
         return state, SampledBlock(
             regression, assembled.offset, assembled.gain, z, errors, self.form.units.states
