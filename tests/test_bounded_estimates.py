@@ -324,3 +324,19 @@ def test_where_nothing_is_known_yet_the_end_says_what_is_near():
     np.testing.assert_allclose(
         found.parameters(slice(0, 1))[0], [[0.1, 0.9], [0.8, 0.2], [0.1, 0.9]], atol=1e-9
     )
+
+
+@pytest.mark.parametrize("bounds", [{"unknowns": {"leak": [0, None]}}, BOUNDS])
+def test_statistics_over_seeds_are_those_of_the_estimates_within_bounds(bounds):
+    def made(**noise):
+        return run(
+            TANK, observer={"bounds": bounds}, estimator={"name": "least_squares"},
+            noise={"name": "gaussian", "outputs": 0.2, "sample_time": 0.2, **noise},
+            time={"horizon": 4, "samples": 3},
+        ).details
+
+    own = [made(seed=seed).estimation for seed in range(3)]
+    errors = np.array([each.parameters[0, -1] - each.true_parameters[-1] for each in own])
+    found = made(seeds=3).noise
+    np.testing.assert_allclose(found.bias[0], errors.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(found.deviation[0], errors.std(axis=0, ddof=1), atol=1e-9)

@@ -550,6 +550,19 @@ def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():
     assert labels(*both[:2], ("c", "drem", 10.0)) == ["b", "c"]
 
 
+def test_a_gain_that_only_some_cases_of_an_estimator_have_tells_them_apart():
+    from gpebo_cli.results.comparison import varying
+    from gpebo_cli.results.finished import Case
+
+    def told(*chosen):
+        every = ({"estimator": "drem", **one} for one in chosen)
+        return varying([Case("a", Path("a"), 0, one, {}) for one in every])
+
+    assert told({"gamma": 1.0}, {"gamma_a": 1.0, "gamma_b": 1.0}) == ["gamma", "gamma_a", "gamma_b"]
+    assert told({"gamma": 1.0}, {"gamma": 1.0, "time.horizon": "3"}) == []
+    assert told({"gamma": 1.0}, {"estimator": "ls_drem"}) == ["estimator"]
+
+
 def test_a_map_has_each_case_in_its_place():
     import numpy as np
 

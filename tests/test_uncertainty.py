@@ -233,8 +233,10 @@ UNEVEN = np.cumsum(np.random.default_rng(0).uniform(0.1, 1.0, 8))
     ([UNEVEN], "linear", {"name": "least_squares", "f0": 0.1, "beta": 0.3},
      {"remedy": "reset", "reset_times": [2.0, 3.0], "reset_keep": 0.5}),
     ([PAUSE, UNEVEN], "linear", {"name": "least_squares"}, {}),
+    ([PAUSE[:4], PAUSE + 3.0], "zoh", {"name": "least_squares"}, {}),  # 3 + (0.6 - 3) > 0.6
     ([PAUSE], "cubic", {"name": "least_squares"}, {}),
     ([PAUSE, UNEVEN], "cubic", {"name": "least_squares", "beta": 0.3}, {}),
+    ([UNEVEN, PAUSE[:3], UNEVEN[:2]], "cubic", {"name": "least_squares"}, {}),
     ([UNEVEN], "cubic", {"name": "gradient"}, {"remedy": "reset", "reset_times": [2.0, 3.0]}),
 ])
 def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, more, tmp_path):

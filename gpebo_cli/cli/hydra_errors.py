@@ -25,6 +25,11 @@ _NO_MATCH = re.compile(r"^Could not override '([^']+)'\.\s+No match in the defau
 _MISSING_IN = re.compile(r"^In '([^']+)'")
 _EXTRAS = {"joblib": "parallel", "ray": "ray", "submitit_slurm": "slurm", "submitit_local": "slurm"}
 _LONGEST = 400
+_AS_A_WHOLE = "a list is given as a whole, as in plant.outputs=[y]"
+_OF_LISTS = {
+    "list index out of range": _AS_A_WHOLE, "is not an int": _AS_A_WHOLE,
+    "Cannot merge DictConfig with ListConfig": "it has keys and is no list",
+}
 _OF_NUMBERS = ("time", "solver", "excitation")  # sections without a list
 
 
@@ -53,7 +58,11 @@ def explain(error: BaseException, arguments: Arguments) -> str:
     if match := _QUOTED.search(text):
         return _unknown_key(match[1], cause, arguments)
     if isinstance(cause, OmegaConfBaseException):
-        text = f"{text}: {cause.msg or cause}" if text else str(cause.msg or cause)
+        word, reason = text.removeprefix("Error merging override "), str(cause.msg or cause)
+        for theirs, ours in _OF_LISTS.items():
+            if theirs in reason:
+                return f"{word}: {ours}"
+        text = f"{word}: {reason}" if word else reason
     return _one_line(text)
 
 

@@ -27,6 +27,11 @@ def main(words: list[str]) -> int:
         if composition.show(hydra, arguments):
             return 0
         config, swept = composition.compose(hydra, arguments)
+        own, other = ("sweep", "run") if swept else ("run", "sweep")
+        if any(word.lstrip("+").startswith(f"hydra.{other}.dir=") for word in arguments.overrides):
+            raise ConfigError(
+                f"hydra.{other}.dir: the folder of this {own} is given by hydra.{own}.dir=FOLDER"
+            )
         if not swept:
             return _once(config, arguments)
 

@@ -125,7 +125,7 @@ def continuous(
         with stage("seeds") as pace:
             noise = over_seeds(
                 observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
-                pace, known.independent, np.isfinite(estimation.parameters[0, -1]),
+                pace, known.independent, np.isfinite(estimation.parameters[0, -1]), system,
             )
     unknown = [
         name for name, is_known in told.items() if not (is_known or name in observation.unseen)

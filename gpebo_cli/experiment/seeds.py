@@ -3,7 +3,8 @@
 Where ψ does not depend on the signals, Y and all estimators are affine in them. Then all seeds
 share the simulation, the mesh, the observer's matrices, ψ and whatever an estimator makes of it
 (Gram matrices, filters, mixing); a seed is one more right-hand side of the same linear systems.
-Where it does (matrices along noisy signals, resets at estimates), every seed is observed by itself.
+Where it does (matrices along noisy signals, resets at estimates), and with bounds, every seed is
+observed by itself.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import estimate
+from gpebo_cli.experiment.bounds import bounded
 from gpebo_cli.experiment.limits import Pace
 from gpebo_cli.experiment.noise import (
     NoiseLevels,
@@ -27,7 +29,7 @@ from gpebo_cli.experiment.noise import (
     sampled_mesh,
 )
 from gpebo_cli.experiment.result import NoiseStatistics
-from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.observers._base import Observation, Response
 from gpebo_cli.regression.estimator import Estimator
@@ -64,7 +66,7 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
     theta: Array, estimator: Estimator, levels: NoiseLevels, pace: Pace,
-    columns: IntArray, told: BoolArray,
+    columns: IntArray, told: BoolArray, system: DescriptorSystem,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
@@ -79,7 +81,7 @@ def over_seeds(
     done = pace(len(seeds), f"noise.seeds with {len(estimator.cases)} cases")
 
     def observed() -> Iterator[Observation]:
-        if observation.respond is not None:
+        if observation.respond is not None and not observation.bounds:
             for many in _added(observation, observation.respond, signals, levels):
                 yield replace(observation, regression=many)
             return
@@ -88,7 +90,8 @@ def over_seeds(
 
     found = list[Array]()
     for own in observed():
-        each, truth = _at(horizon, own, estimator, columns), _truth(own, horizon, theta, signals)
+        each = _at(horizon, own, estimator, columns, system)
+        truth = _truth(own, horizon, theta, signals)
         found.append(_with_unknowns(each, own.regression, horizon) - truth[:, None])
         done(sum(part.shape[-1] for part in found))
     error, S = np.concatenate(found, axis=-1), observation.regression.parametrisation
@@ -104,12 +107,16 @@ def over_seeds(
     )
 
 
-def _at(horizon: Array, own: Observation, estimator: Estimator, columns: IntArray) -> Array:
+def _at(
+    horizon: Array, own: Observation, estimator: Estimator, columns: IntArray,
+    system: DescriptorSystem,
+) -> Array:
     """η̂ (g, p, c) at the horizon, of several seeds at once or of one."""
     by = own.estimator or estimator
     made = by.estimate if own.regression.realisations else partial(estimate, by)
     found, some = own.about(columns, lambda about, _: made(about, horizon))
-    values = found.parameters(slice(None))[:, 0]
+    held = bounded(own.bounds, system, own, some, found, horizon) if own.bounds else found
+    values = held.parameters(slice(None))[:, 0]
     values = values if values.ndim == 3 else values[..., None]
     eta = np.zeros((len(values), len(own.parameters), values.shape[2]))
     eta[:, some] = values

@@ -102,7 +102,9 @@ def joined_observation(
     ])
     same = all(each.psi.values.shape[2] == rows for each in regressions)
     errors = [each.errors for each in observations if each.errors is not None]
-    starts = np.array([each.mesh.edges[0] for each in regressions]) + shifts
+    # Where one ends, which the next one's first row may miss by rounding.
+    sizes = [0, *(each.mesh.size for each in regressions[:-1])]
+    starts = psi.mesh.edges[np.cumsum(sizes)]
 
     def errors_at(k: int, t: Array, inside: Array) -> ErrorSystem:
         return errors[k](t - shifts[k], inside - shifts[k])

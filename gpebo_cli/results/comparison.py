@@ -43,12 +43,19 @@ def names(cases: Sequence[Case]) -> list[str]:
 def varying(cases: Sequence[Case]) -> list[str]:
     """Those of the choices (settings and gains) that are not the same for all who have them.
 
-    A gain that only some estimators have follows from the estimator and says nothing new.
+    A gain that only some estimators have follows from the estimator and says nothing new; one that
+    only some cases of an estimator have, as beside a mapping by parameter, does.
     """
     values: dict[str, set[Value]] = {}
+    gains: dict[Value | None, set[str]] = {}
     for case in cases:
         for name, value in case.chosen.items():
             values.setdefault(name, set()).add(value)
+            if isinstance(value, float):
+                gains.setdefault(case.chosen.get("estimator"), set()).add(name)
+    for case in cases:
+        for name in gains.get(case.chosen.get("estimator"), set()).difference(case.chosen):
+            values[name].add("")
     return [name for name, found in values.items() if len(found) > 1]
 
 
