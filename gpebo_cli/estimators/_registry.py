@@ -30,7 +30,7 @@ def build(settings: Mapping[str, object]) -> Estimator:
         ConfigError: unknown name or key, with the nearest known one.
     """
     several = {key: value for key, value in settings.items() if _is_axis(value)}
-    hints = get_type_hints(_ESTIMATORS.find(settings))
+    hints = get_type_hints(_ESTIMATORS.find(settings)) if several else {}  # slow
     chosen = combinations({
         key: axis(value, f"estimator.{key}", "finite") for key, value in several.items()
         if hints.get(key) in (float, int)

@@ -148,7 +148,7 @@ class BoundedEstimates:
     def parameters(self, cases: slice) -> Array:
         """η̂ of some cases at the times, (g, M, p)."""
         found = np.array(self.plain.parameters(cases))
-        for i, eta in enumerate(found, cases.start):
+        for i, eta in enumerate(found, cases.start or 0):
             metric = self.plain.weights(i) if isinstance(self.plain, Weighing) else self.gram
             self.active[i] = self._move(eta, metric)
         return found
