@@ -549,6 +549,9 @@ def test_why_the_other_form_is_taken_is_said(told, why, monkeypatch):
     said = run("descriptor", time={"horizon": 1}).verdict
     assert why in said
     assert ("strangeness-free form" in said) == bool(why)
+    observer = {"name": "gpebo", "remedy": "reset"}  # of which that is not asked
+    run("descriptor", time={"horizon": 1}, observer=observer, estimator="least_squares")
+    assert not told
 
 
 @pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])
