@@ -229,6 +229,13 @@ def test_a_jump_is_right_continuous_and_can_be_asked_for_from_the_left():
     assert step(one, one - 0.01)[0] == 0.0
 
 
+@pytest.mark.parametrize("edge", [-3.0, -1e-9, 1e-9, 3.0])
+def test_a_time_that_misses_an_edge_by_rounding_is_at_it(edge):
+    mesh = Mesh(np.array([-8.0, edge, 8.0]), radau_rule(3))
+    jump = Trajectory(mesh, np.array([0.0, 1.0])[:, None, None] * np.ones((2, 4, 1)))
+    assert jump(edge * np.array([1.0 - 1e-15, 1.0, 1.0 + 1e-15])).ravel().tolist() == [1.0] * 3
+
+
 def test_splitting_keeps_edges_and_marks_what_is_new():
     mesh = initial_mesh(0.0, 3.0, [], 3, radau_rule(3))
     finer, kept = mesh.split(np.array([1, 3, 1]))

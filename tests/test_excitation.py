@@ -23,6 +23,7 @@ from gpebo_cli.evidence.excitation import (
     window_level,
 )
 from gpebo_cli.evidence.metrics import SETTLED, measure_squares, settling_times, time_rms
+from gpebo_cli.findings import Direction
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.linear import LinearRegression
@@ -162,6 +163,7 @@ def test_the_weakest_direction_is_named():
     assert abs(direction["p1"]) == pytest.approx(np.sqrt(0.5), abs=1e-9)
     assert direction["p1"] == pytest.approx(-direction["p2"], abs=1e-9)
     assert str(found.weakest_direction).replace("+", "-") == "-0.707 p1 -0.707 p2"
+    assert str(Direction({"a": -1.0, "b": -0.01, "c": -0.1})) == "-1 a -0.1 c"
 
 
 def test_rounding_is_not_excitation():

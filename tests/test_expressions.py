@@ -19,7 +19,16 @@ from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import Expression, breakpoints, parse, record, shorten, taylor
+from gpebo_cli.model.expressions import (
+    Expression,
+    breakpoints,
+    divisors_of,
+    parse,
+    record,
+    shorten,
+    signal,
+    taylor,
+)
 from gpebo_cli.model.expressions import tape as tape_module
 from gpebo_cli.model.expressions.intervals import Interval
 
@@ -243,6 +252,7 @@ def test_doubling_names_costs_one_operation_each() -> None:
     started = time.process_time()
     values = derivatives("d(p59)", np.linspace(0, 1, 50), 1, **names)
     assert np.isfinite(values).all()
+    assert not divisors_of(read("p59", **names).node)
     assert time.process_time() - started < LIMIT
 
 
@@ -526,6 +536,19 @@ def test_a_value_that_is_not_finite_inside_an_interval() -> None:
 def test_bounds_of_waves_and_powers_hold_their_crests_and_poles(function, low, high, least, most):
     found = function(Interval(np.array([low]), np.array([high])))
     np.testing.assert_allclose([found.low[0], found.high[0]], [least, most], atol=1e-14)
+
+
+@pytest.mark.parametrize("end", [-3.0, 3.0])
+def test_every_bound_is_wider_than_its_rounding(end):
+    found = Interval(np.array([end]), np.array([end])) + 0.0
+    assert found.low < end < found.high
+
+
+def test_an_operation_without_a_value_along_a_signal_is_refused():
+    """Though what comes of it is a number again."""
+    tape = record([parse("1/(1 + 1/y)", {"y": signal("y", 0, "output")}, "here")])
+    with pytest.raises(ConfigError, match=r"here = '1/\(1 \+ 1/y\)' has no finite value at t = 2"):
+        tape.taylor(np.array([1.0, 2.0]), 0, None, np.array([[[1.0], [0.0]]]))
 
 
 # Jumps and kinks

@@ -564,6 +564,9 @@ def test_why_the_other_form_is_taken_is_said(told, why, monkeypatch):
     said = run("descriptor", time={"horizon": 1}).verdict
     assert why in said
     assert ("strangeness-free form" in said) == bool(why)
+    observer = {"name": "gpebo", "remedy": "reset"}  # of which that is not asked
+    run("descriptor", time={"horizon": 1}, observer=observer, estimator="least_squares")
+    assert not told
 
 
 @pytest.mark.parametrize("remedy", ["reset", "output_injection", "current_coordinates"])
@@ -924,14 +927,17 @@ def test_assumption_1_fails_at_the_time_that_is_named(size):
 def test_what_is_left_where_assumption_1_fails_is_left_at_all_times():
     """Of v and w one is told, but not at t = 2.1, which is met when elements are cut."""
     system = plant_from_mapping({
-        "name": "less", "states": ["a", "v", "w"], "outputs": ["y"], "C": [[1, 0, 0]],
+        "name": "less", "states": ["a", "v", "w"], "outputs": ["y", "z"], "C": [[1, 0, 0]] * 2,
         "E": np.diag([1, 0, 0]).tolist(), "initial_state": [0, 0, 0],
         "A": [[-1, 0, 0], [0, "1 - exp(-((t - 2.1)/0.05)**2)", 0], [0, 0, 0]],
     })
     mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
-    signals = Measurements(*(Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 1)))
-    found = reduced_system(system, signals, SOLVER, form="given", in_part=True)
+    signals = Measurements(*(Trajectory(mesh, np.zeros((8, 6, count))) for count in (0, 2)))
+    found = reduced_system(
+        system, signals, SOLVER, form="given", in_part=True, weights={"y": 4.0, "z": 36.0}
+    )
     assert found.lost.tolist() == [False, False, True]
+    assert found.first.output_scale[1] == pytest.approx(3.0 * found.first.output_scale[0])
     t = np.array([1.0, 2.1, 3.0])
     with pytest.raises(ModelError, match=r"the rank of \[ΠA; C\] .* changes at t = 2\.1; use"):
         found.matrices(t, t)

@@ -313,6 +313,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),
     ("signals", "tails", partial(_signal, least=True)),
+    ("signals", "tails", partial(_signal, c=0)),
     ("signals", "largest", lambda rng: (1e-3 * rng.normal(size=(4, 7, 21)),)),
     ("signals", "largest", lambda rng: (np.swapaxes(rng.normal(size=(3, 2, 30)), 0, 1),)),
     ("signals", "sample", _samples),
@@ -539,6 +540,16 @@ def test_a_chain_says_how_far_it_is_finite():
     with np.errstate(over="ignore", invalid="ignore"):
         one, other = both("elements", "chain", (1e200 * maps, *others))
     assert one[1] == other[1] == 1
+
+
+def test_nothing_is_renewed_that_is_not_finite():
+    maps, *others = _maps(np.random.default_rng(0))
+
+    def renew(reached):
+        assert np.isfinite(reached).all()
+        return reached
+
+    assert kernels.elements.chain(1e200 * maps, *others, renew)[1] == 1
 
 
 def test_kernels_are_there_where_they_were_asked_for():

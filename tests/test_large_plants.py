@@ -235,6 +235,18 @@ def test_an_input_that_is_zero_drives_nothing():
     np.testing.assert_allclose(found.signals.states.final, final, atol=1e-9)
 
 
+def test_a_full_E_that_moves_is_no_constant_one():
+    """(1 + 0.3 cos t) M x' = −M x leaves every state what it was times one function of time."""
+    M = np.eye(14) + 0.05
+    E = [[f"{v}*(1 + 0.3*cos(t))" for v in row] for row in M.tolist()]
+    system = plant(lambda n: (M, -M, 0.0 * M[:, :1], M[:2]), cells=14, E=E, name="full")
+    found = large.large_simulation(system, TimeSettings(horizon=1.0), SolverSettings(tol=1e-9))
+    t = 0.5 * np.arange(3)
+    ways = np.arctan(np.sqrt(0.7 / 1.3) * np.tan(0.5 * t)) * 2.0 / np.sqrt(0.91)
+    true = np.exp(-ways)[:, None] * system.initial_state
+    np.testing.assert_allclose(found.signals.states(t), true, rtol=1e-8)
+
+
 def test_a_jump_of_the_input_moves_algebraic_states_only():
     found, dense = both(plant(ladder, varying=True, u="sin(t) + step(t - 3)"))
     (t, before, jump), (when, _, other) = found.jumps[0], dense.jumps[0]

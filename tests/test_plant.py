@@ -431,6 +431,11 @@ def test_refused_in_one_line(case: str) -> None:
         plant_from_mapping(mapping)
 
 
+def test_a_name_that_is_no_half_of_a_function_is_not_asked_to_be_quoted() -> None:
+    with pytest.raises(ConfigError, match=r"and starts with no digit$"):
+        plant_from_mapping(mine(states=["x-1", "x2"]))
+
+
 def test_messages_name_the_file() -> None:
     with pytest.raises(ConfigError, match=r"^plant mine \(dir/mine.yaml\): A is missing"):
         plant_from_mapping(without("A"), "dir/mine.yaml")

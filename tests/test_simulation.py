@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
-from gpebo_cli.simulation.known import known_resolved
+from gpebo_cli.simulation.known import few_elements, known_resolved
 from gpebo_cli.simulation.large import dense_structure
 from gpebo_cli.simulation.simulate import _growth_resolved, _missed, simulate
 
@@ -699,6 +700,18 @@ def test_growth_is_refused_with_its_time_and_its_reason(rate, solver, why):
     system = plant(states=["x"], E=[[1]], A=[[rate]], initial_state={"x": 1})
     with pytest.raises(GpeboError, match=why):
         simulate(system, TimeSettings(horizon=20.0), SolverSettings(name=solver))
+
+
+@pytest.mark.parametrize(("coarse", "bounded", "taken"), [
+    ([0.0, 4.0, 8.0], True, True), ([0.0, 4.0, 8.0], False, False), ([0.0, 1.0, 8.0], True, False),
+])
+def test_fewer_elements_are_taken_where_nothing_hides_in_them_and_none_is_too_long(
+    coarse, bounded, taken
+):
+    source = SimpleNamespace(resolved=lambda _: (np.array(coarse), bounded))
+    mesh = Mesh(np.linspace(0.0, 8.0, 33), radau_rule(3))
+    found = few_elements(SimpleNamespace(coefficients=source), mesh, np.zeros(0), 4.0)
+    np.testing.assert_array_equal(found.edges, coarse if taken else mesh.edges)
 
 
 @pytest.mark.parametrize("off", [0.0, 1e-6])

@@ -8,7 +8,7 @@ the pattern of A is a tree, nothing else is full. What is to be done follows fro
 from __future__ import annotations
 
 from functools import lru_cache
-from heapq import heapify, heappop, heappush
+from heapq import heappop, heappush
 
 import numpy as np
 
@@ -98,8 +98,7 @@ def steps_of(row_bytes: bytes, column_bytes: bytes) -> tuple[IntArray, IntArray,
     products: list[tuple[int, int, int, int]] = []
     forward: list[tuple[int, int, int]] = []
     backward: list[tuple[int, int, int]] = []
-    order = [(len(near), i) for i, near in enumerate(beside)]
-    heapify(order)
+    order = sorted((len(near), i) for i, near in enumerate(beside))  # is a heap
     left = set(range(d))
     while left:
         near, i = heappop(order)

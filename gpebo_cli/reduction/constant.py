@@ -113,7 +113,7 @@ def constant_form(E: Array, A: Array, max_mu: int) -> ConstantForm:
         place += len(C)
     size = np.maximum(np.linalg.norm(A2, axis=1), _TINY)[:, None]
     A2, known_in = A2 / size, known_in / size
-    free = np.linalg.svd(A2)[2][count:].T if count else np.eye(n)
+    free = np.linalg.svd(A2)[2][count:].T
     Z1 = np.linalg.svd(e @ free, full_matrices=False)[0]
     whole = np.concatenate([Z1.T @ e, A2])
     # Rows of A2 have unit length: what constraints determine is of the same scale before and after.

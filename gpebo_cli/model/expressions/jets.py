@@ -23,10 +23,10 @@ Coefficient = NDArray[np.float64] | float
 Jet = list[Coefficient]
 
 
-def convolve(a: Jet, b: Jet, k: int, first: int = 0) -> Coefficient:
-    """``sum(a[j] * b[k - j])`` over ``first <= j <= k``, where both exist."""
+def convolve(a: Jet, b: Jet, k: int) -> Coefficient:
+    """``sum(a[j] * b[k - j])`` over ``0 <= j <= k``, where both exist."""
     total: Coefficient | None = None
-    for j in range(max(first, k - len(b) + 1), min(k, len(a) - 1) + 1):
+    for j in range(max(0, k - len(b) + 1), min(k, len(a) - 1) + 1):
         term = a[j] * b[k - j]
         total = term if total is None else total + term
     return 0.0 if total is None else total
@@ -58,7 +58,7 @@ def divide(a: Jet, b: Jet, order: int) -> Jet:
     """q = a / b, from q b = a."""
     q: Jet = [np.divide(a[0], b[0])]
     for k in range(1, min(order + 1, len(a) if len(b) == 1 else order + 1)):
-        rest = (a[k] if k < len(a) else 0.0) - convolve(b, q, k, first=1)
+        rest = (a[k] if k < len(a) else 0.0) - convolve(b, q, k)
         q.append(np.divide(rest, b[0]))
     return q
 
@@ -102,7 +102,7 @@ def exp(a: Jet, order: int) -> Jet:
         return e
     w = weighted(a, order)
     for k in range(1, order + 1):
-        e.append(convolve(w, e, k, first=1) / k)
+        e.append(convolve(w, e, k) / k)
     return e
 
 
@@ -182,8 +182,8 @@ def wave(name: str, a: Jet, order: int) -> Jet:
     c: Jet = [np.cosh(a[0]) if hyperbolic else np.cos(a[0])]
     w = weighted(a, order)
     for k in range(1, order + 1):
-        s.append(convolve(w, c, k, first=1) / k)
-        slope = convolve(w, s, k, first=1) / k
+        rises, slope = (convolve(w, x, k) / k for x in (c, s))
+        s.append(rises)
         c.append(slope if hyperbolic else -slope)
     return s if name.startswith("s") else c
 
@@ -199,7 +199,7 @@ def tangent(a: Jet, order: int, hyperbolic: bool = False) -> Jet:
         square = convolve(y, y, k - 1)
         signed = -square if hyperbolic else square
         slope.append(signed + 1.0 if k == 1 else signed)
-        y.append(convolve(w, slope, k, first=1) / k)
+        y.append(convolve(w, slope, k) / k)
     return y
 
 
