@@ -340,3 +340,17 @@ def test_statistics_over_seeds_are_those_of_the_estimates_within_bounds(bounds):
     found = made(seeds=3).noise
     np.testing.assert_allclose(found.bias[0], errors.mean(axis=0), atol=1e-9)
     np.testing.assert_allclose(found.deviation[0], errors.std(axis=0, ddof=1), atol=1e-9)
+
+
+@pytest.mark.parametrize("u", ["1 - 3*step(t - 1.3)", "-2*t + 4*step(t - 1.3)"])
+def test_bounds_hold_on_both_sides_of_a_jump(u):
+    """z = h + u jumps with u, and is lowest there."""
+    plant = one_state(
+        states=["h", "z"], inputs={"u": u}, unknowns={"k": 1}, E=[[1, 0], [0, 0]],
+        A=[[-1, 0], [1, -1]], B=[[1], [1]], F=[[1], [0]], C=[[1, 0]], initial_state=[0.2, 1.2],
+    )
+    result = run(
+        plant, observer={"bounds": {"states": {"z": [-0.3, None]}}}, estimator="least_squares",
+        time={"horizon": 2, "samples": 2001},
+    )
+    assert result.estimates["z"].min() > -0.3 - 1e-6

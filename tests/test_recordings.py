@@ -1060,6 +1060,20 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+def test_outputs_count_alike_in_all_files(tmp_path):
+    """What acts from the first on the second state grows a thousandfold until the second file."""
+    plant = one_state(
+        states=["a", "b"], inputs={"u": 0}, outputs=["y", "z"], E=np.eye(2).tolist(),
+        A=[[-1, 0], ["0.001 + t", -1]], B=[[1], [0]], C=np.eye(2).tolist(), initial_state=[0, 0],
+    )
+    t = np.linspace(0.0, 1.0, 6)
+    files = [str(tmp_path / f"{name}.csv") for name in "ab"]
+    for file, start in zip(files, (0.0, 3.0), strict=True):
+        write_table(file, {"t": start + t, "u": t, "y": np.cos(t), "z": np.sin(t)})
+    psi = run(plant, data=files, time={"samples": 3}).details.regression.psi
+    np.testing.assert_array_equal(psi[2, :, 2:], psi[0, :, :2])
+
+
 def test_many_files_are_estimated_as_well_as_one(tmp_path):
     """What ls_drem learns is learnt once the last one has begun, as if it were the first."""
     files = [

@@ -23,7 +23,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import ActiveBound
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.numerics.mesh import Samples, Trajectory
+from gpebo_cli.numerics.mesh import SNAP, Samples, Trajectory
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.estimator import Estimates, Weighing
 from gpebo_cli.schema import check_keys, number, unknown
@@ -31,6 +31,7 @@ from gpebo_cli.schema import check_keys, number, unknown
 _TOLERANCE = 1e-10  # of a quantity's size: by less no bound is violated
 _UNMOVED = 1e-12  # share of a state's largest gain, below which no estimate moves it
 _FLOOR = 1e-14  # of G at the end: what counts as known where nothing has been excited yet
+_BEFORE = 1e-9  # of an element: where a state is looked at that jumps at its end
 _AT_ONCE = 4  # violated minima of one bound that are added together
 _STILL = 1e-5  # share of a bracket by which a minimum may be off the row that holds it
 _PLACES = np.linspace(0.0, 1.0, 9)  # in the bracket of a minimum, of which a round leaves an eighth
@@ -159,7 +160,9 @@ class BoundedEstimates:
         normals, levels = np.zeros((0, len(grid), eta.shape[1])), np.zeros((0, len(grid)))
         if self.states:
             mesh, known = self.state_map.offset.mesh, self._rows
-            grid = np.union1d(mesh.points.ravel(), grid) if known is None else known
+            if known is None:
+                known = np.union1d(np.append(mesh.points.ravel(), self._before_jumps), grid)
+            grid = known
             normals, levels = self._of_states(grid)
         moving = np.linalg.norm(normals, axis=2)
         most = moving.max(axis=1, initial=0.0)
@@ -221,6 +224,17 @@ class BoundedEstimates:
         )
 
     @cached_property
+    def _before_jumps(self) -> Array:
+        """Times next to those where a state jumps, at which it is what it was before."""
+        mesh = self.state_map.offset.mesh
+        gain, offset = (signal.values for signal in self._signals)
+        both = np.concatenate([gain, offset[..., None]], axis=3)
+        jump = np.abs(both[1:, 0] - both[:-1, -1]).max(axis=(1, 2), initial=0.0)
+        some = np.flatnonzero(jump > _TOLERANCE * np.abs(both).max(initial=0.0))
+        edges, steps = mesh.edges[some + 1], mesh.steps[some]
+        return np.asarray(edges - np.maximum(_BEFORE * steps, 4.0 * SNAP * np.abs(edges)))
+
+    @cached_property
     def _slopes(self) -> tuple[Trajectory, Trajectory]:
         gain, offset = self._signals
         return gain.derivative(), offset.derivative()
@@ -268,6 +282,10 @@ class BoundedEstimates:
             found = 0.5 * (low + high)
             N, d = (each[which] for each in self._of_states(found))
         below = N @ eta - d
+        # At a jump the lowest is where it was seen.
+        here = margin[side, at] < below
+        below[here], found[here] = margin[side, at][here], t[at][here]
+        N[here], d[here] = normals[side, at][here], levels[side, at][here]
         rows: list[_Row] = []
         for i in np.argsort(below):
             b = self.states[side[i]]

@@ -80,6 +80,8 @@ def continuous(
                 (each.inputs.mesh.size, each.inputs.mesh.points.size)
                 for each in source.pieces if each is not known
             ],
+            Measurements(source.pieces[0].inputs, source.pieces[0].outputs)
+            if source.pieces else None,
         )
         return observer.observe(begins, seen, settings.solver)
 

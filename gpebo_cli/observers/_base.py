@@ -78,6 +78,7 @@ class Measurements:
     asked: Array | None = None  # None: any
     # Elements and points of the meshes of other recordings, whose results are kept as well, each
     beside: Sequence[tuple[int, int]] = ()  # with columns for its own start.
+    like: Measurements | None = None  # the first recording, whose start decides on units; None: own
 
     @property
     def mesh(self) -> Mesh:

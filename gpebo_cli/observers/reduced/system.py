@@ -186,6 +186,10 @@ def reduced_system(
     signals.check_memory(system)
     along = partial(signals.at, system=system) if system.coefficients.signals else None
     at, lost = along(t, inside) if along else None, None
+    if units is None and (like := signals.like):
+        begin_t, within = like.mesh.points.ravel()[:1], like.mesh.inside.ravel()[:1]
+        seen = like.at(begin_t, within, system) if along else None
+        units = EquationForm.given(system, None, begin_t, within, seen).units
     try:
         used, first, note = choose_form(
             system, t, inside, at, signals.derivatives, solver, form, weights, units,
@@ -193,6 +197,7 @@ def reduced_system(
         )
     except NotObservableError as error:
         used = EquationForm.given(system, signals.derivatives, t, inside, at)
+        used = used if units is None else replace(used, units=units)
         left = untouched(used, t, inside, at, solver.rank_tol) if in_part else None
         if left is None:
             raise
