@@ -311,7 +311,7 @@ class Netlist:
                 f"{head} is not read: elements are linear, R L C K V I E G F H S T X, and "
                 "expressions stand in braces"
             )
-        # .param has been read. Other commands ask for analyses, which gpebo's own settings describe.
+        # .param has been read. Others ask for analyses, which gpebo's own settings describe.
 
     def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:
         place = scope.place
