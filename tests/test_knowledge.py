@@ -197,6 +197,11 @@ def test_rounding_of_Y_is_larger_in_what_is_told_less():
         knowledge(G[None], np.ones(2), np.ones(1)).doubt(G @ np.ones(2), across)[0][0]
         for G in (np.array([[1.0, c], [c, 1.0]]) for c in shares)
     ]
+    turned, sign = [], np.array([-1.0, 1.0])
+    for G in (np.array([[1.0, -c], [-c, 1.0]]) for c in shares):
+        known = knowledge(G[None], np.ones(2), np.ones(1))
+        turned.append(known.doubt(G @ sign, across * sign)[0][0])
+    np.testing.assert_allclose(turned, found, rtol=1e-9)
     expected = np.sqrt(2.0 * (1.0 + shares) / (1.0 - shares)) + np.sqrt(2.0)
     np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-9)
     alone = knowledge(np.eye(2)[None], np.ones(2), np.ones(1))

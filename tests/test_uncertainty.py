@@ -267,9 +267,11 @@ def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, mo
     np.testing.assert_allclose(std, np.linalg.norm(each, axis=0)[known], rtol=1e-3)
 
 
-def test_what_errors_of_an_input_did_before_a_reset_stays_in_the_estimate():
+@pytest.mark.parametrize("unknowns", [{"k": 1}, {"k": 1, "without_effect": 1}])
+def test_what_errors_of_an_input_did_before_a_reset_stays_in_the_estimate(unknowns):
     """Of each row by itself; e₀ since a reset is about an estimate."""
-    plant = one_state(inputs={"u": 0}, unknowns={"k": 1}, A=[[-1]], B=[[1]], F=[[-1]])
+    plant = one_state(inputs={"u": 0}, unknowns=unknowns, A=[[-1]], B=[[1]],
+                      F=[[-1, 0][: len(unknowns)]])
     t = np.array([0.0, 0.7, 1.5, 3.0])
 
     def found(error):
