@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,6 +27,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.observers.remedies import reset
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.report import run_lines
 from gpebo_cli.results.summary import summary
@@ -622,6 +624,15 @@ def test_the_finite_time_law_is_as_uncertain_as_what_it_divides_by_makes_it(name
     made = one[:, 1:, 0] / (1.0 - np.minimum(left[:, 1:], 0.8))
     np.testing.assert_allclose(other[:, 1:, 0], made, rtol=1e-6)
     assert np.ptp(left[:, 2:-2]) > 0.9
+
+
+def test_resets_that_do_not_say_what_errors_do_have_no_deviations(monkeypatch):
+    made = reset.Reset
+    monkeypatch.setattr(reset, "Reset", lambda *a, **more: replace(made(*a, **more), errors=None))
+    found = run("descriptor", observer={"name": "gpebo", "remedy": "reset", "reset_times": [1.0]},
+                noise=NOISE, time={"horizon": 2.0, "samples": 3})
+    assert found.details.estimation.parameters_std is None
+    assert "this remedy cannot tell" in found.verdict
 
 
 @pytest.mark.parametrize(("plant", "more", "why"), [
