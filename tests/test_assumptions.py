@@ -273,6 +273,15 @@ def test_of_a_recording_what_the_observer_needs_is_named_and_without_one_there_i
     assert check(plant, data=data, observer="none") == ()
 
 
+def test_where_the_form_is_free_the_other_one_is_told_beside_equations_as_given():
+    one, other = (
+        next(a.evidence for a in check("descriptor", observer={"form": form})
+             if a.name == "Assumption 1") for form in ("auto", "strangeness_free")
+    )
+    value = other["smallest_singular_value"]
+    assert one["strangeness_free"] == f"holds, too, with singular value {value:.4g}"
+
+
 def evidence(plant, **time):
     """By names of assumptions, after a run with five samples."""
     details = run(plant, time={"samples": 5, **time}).details

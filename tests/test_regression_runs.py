@@ -183,6 +183,12 @@ def test_noise_of_a_signal_in_psi_has_no_deviation_to_state(inputs, stated):
     assert (found.details.estimation.parameters_std is not None) == stated
 
 
+def test_squares_that_are_no_numbers_are_refused():
+    large = {"name": "large", "unknowns": {"a": 1.0}, "psi": [["1e160*cos(t)"]]}
+    with pytest.raises(SolverError, match=r"ψᵀψ is too large for a number near t = 0; write Y and"):
+        run(regression=large, estimator="least_squares", time={"horizon": 2, "samples": 5})
+
+
 def test_arrays_by_name_and_what_can_be_checked(tmp_path):
     t = np.linspace(0.0, 10.0, 1001)
     measured = {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]}
