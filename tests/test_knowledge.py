@@ -268,6 +268,7 @@ def test_what_is_seen_is_estimated_as_if_there_were_nothing_else(observer):
     for of, one, other in (
         (("hat", "std"), run(WHOLE, estimator="ls_drem", **given),
          run(ALONE, estimator="ls_drem", **given)),
+        (("hat",), *(run(plant, estimator="drem", gamma=1e6, **given) for plant in (WHOLE, ALONE))),
         (("hat",), run(WHOLE, estimator="gradient", gamma=gains, **given),
          run(WHOLE, estimator="gradient", gamma=100.0, **given)),
     ):
