@@ -207,11 +207,14 @@ def test_nothing_to_estimate_is_exciting_and_gives_the_states():
         )
 
 
+@pytest.mark.parametrize("growth", [None, 1e20])  # at a rate that nobody says
 @pytest.mark.parametrize(("error", "count"), [(1e-9, 0), (2.0, 1)])
-def test_an_observer_that_its_own_errors_spoil_says_so(error, count):
+def test_an_observer_that_its_own_errors_spoil_says_so(error, count, growth):
     """An estimate of the error is never larger than the signals without a word."""
     class Spoilt:
-        assumptions, growth, growth_rate, error_estimate = (), None, None, error
+        assumptions, growth_rate, error_estimate = (), None, error
+
+    Spoilt.growth = growth
 
     assert len(warnings(Spoilt())) == count
     assert all("2.0e+00 of their size" in line for line in warnings(Spoilt()))

@@ -770,6 +770,9 @@ def test_to_xarray():
     np.testing.assert_array_equal(estimates["b_hat"].to_numpy()[0], table["b_hat"])
     assert result.to_xarray()["b"].attrs == {"units": "V"}
     assert estimates["e0_b_hat"].attrs == {"units": "V"}  # an initial error has its state's
+    plant = one_state(states=["v_true"], outputs=["v"], units={"v_true": "m", "v": "mm"})
+    signals = run(plant, observer="none", time={"horizon": 1.0}).to_xarray()
+    assert [signals[name].attrs["units"] for name in ("v_true", "v")] == ["m", "mm"]
 
 
 @pytest.mark.parametrize("package", ["control", "xarray"])
