@@ -164,6 +164,9 @@ def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
     assert len(repr(simulation)) < 1000  # arrays over time are not printed
     assert len(repr(observe(system, measured))) < 2000
     assert "t = 0 to 2 s" in repr(simulation)
+    assert repr(run("circuit", observer="none", time={"samples": 3})) == (
+        "<gpebo run of circuit, t = 0 to 20 s, none, 3 times>"
+    )
     shown = circuit._repr_html_()
     assert escape(circuit.verdict) in shown
     assert shown.count("<tr>") == 3

@@ -207,11 +207,14 @@ def test_nothing_to_estimate_is_exciting_and_gives_the_states():
         )
 
 
+@pytest.mark.parametrize("growth", [None, 1e20])  # at a rate that nobody says
 @pytest.mark.parametrize(("error", "count"), [(1e-9, 0), (2.0, 1)])
-def test_an_observer_that_its_own_errors_spoil_says_so(error, count):
+def test_an_observer_that_its_own_errors_spoil_says_so(error, count, growth):
     """An estimate of the error is never larger than the signals without a word."""
     class Spoilt:
-        assumptions, growth, growth_rate, error_estimate = (), None, None, error
+        assumptions, growth_rate, error_estimate = (), None, error
+
+    Spoilt.growth = growth
 
     assert len(warnings(Spoilt())) == count
     assert all("2.0e+00 of their size" in line for line in warnings(Spoilt()))
@@ -271,6 +274,15 @@ def test_of_a_recording_what_the_observer_needs_is_named_and_without_one_there_i
     assert (failed.name, failed.holds) == ("Rank of E", False)
     assert "from 2 at t = 0 to 1 at t = 0.5" in failed.evidence["found"]
     assert check(plant, data=data, observer="none") == ()
+
+
+def test_where_the_form_is_free_the_other_one_is_told_beside_equations_as_given():
+    one, other = (
+        next(a.evidence for a in check("descriptor", observer={"form": form})
+             if a.name == "Assumption 1") for form in ("auto", "strangeness_free")
+    )
+    value = other["smallest_singular_value"]
+    assert one["strangeness_free"] == f"holds, too, with singular value {value:.4g}"
 
 
 def evidence(plant, **time):

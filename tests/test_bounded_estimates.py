@@ -354,3 +354,16 @@ def test_bounds_hold_on_both_sides_of_a_jump(u):
         time={"horizon": 2, "samples": 2001},
     )
     assert result.estimates["z"].min() > -0.3 - 1e-6
+
+
+def test_a_state_that_an_input_determines_later_is_held_where_estimates_move_it():
+    """z = x = 1 up to t = 2 and then u; of k + (x(0) − k) e^-t below 0.8 the best is 0.8 itself."""
+    plant = one_state(
+        states=["x", "z"], inputs={"u": "sin(3*t)"}, unknowns={"k": 1}, E=[[1, 0], [0, 0]],
+        A=[[-1, 0], ["1 - step(t - 2)", -1]], B=[[0], ["step(t - 2)"]], F=[[1], [0]], C=[[1, 0]],
+        initial_state=[1, 0],
+    )
+    observer = {"name": "gpebo", "bounds": {"states": {"z": [0.2, 0.8]}}}
+    found = run(plant, observer=observer, estimator="least_squares",
+                time={"horizon": 4, "samples": 2}).estimates
+    np.testing.assert_allclose([found["k"][0, -1], found["x"][0, -1]], 0.8, rtol=1e-6)

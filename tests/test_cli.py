@@ -185,6 +185,7 @@ WRONG = [
     (["run", "figures=[nope]"], "nope"),
     (["run", "+output.figures=all"], "output.figures: no such key; did you mean figures?"),
     (["run", "figures.width=wide"], "figures.width: expected column or page"),
+    (["run", "figures.formats=[]"], "some of png, pdf and svg, got an empty list"),
     (["run", "figures.dpi=9"], "figures.dpi: expected 30 to 1200"),
     (["run", "figures.fromats=[png]"], "figures.fromats: no such key; figures has formats, width"),
     (["run", "plant.title=${oc.env:HOME}"], "plant.title: ${…} is not allowed"),

@@ -64,6 +64,8 @@ def test_how_far_estimates_are_off_least_squares_is_told_in_their_sizes():
         "a": 0.3 / LEAST[0], "b": 0.2, "c": 0.7 / LEAST[2], "x": share[3],
     }, rel=1e-6)
     assert ("a, b, c, x are up to 0.2 " in warning) == (told["x"] < 0.2)
+    told, _ = about([LEAST + off], [1.0, 0.05, 1.0, 20.0, 1.0])  # b is negative
+    assert told["b"] == pytest.approx(-0.2 / LEAST[1])
 
 
 @pytest.mark.parametrize(("size", "warned"), [(1e-12, False), (1e-3, True)])

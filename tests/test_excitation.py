@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from plants import observed, reference, shipped
+from plants import observed, one_state, reference, shipped
 from regressions import ETA, fading, regression, three
 from scipy.integrate import quad_vec, trapezoid
 from scipy.optimize import brentq
@@ -93,6 +93,17 @@ def test_a_window_of_samples_of_a_circle(hold):
     level = sampled_window_level(sampled, w)
     assert np.isnan(level[t < -1.0 + w - 1e-6]).all()
     np.testing.assert_allclose(level[t > -1.0 + w - 1e-6], 0.5 * (w - np.sin(w)), rtol=1e-3)
+
+
+def test_t_c_of_a_state_that_grows_is_that_of_what_is_known_of_it_by_then():
+    """x' = a x and ψ = 1: G = (1 − e^(−2 a t))/(2 a) of the x of now, from the first element on."""
+    for rho, a in (5e-3, 10.0), (0.1, 1.0):
+        observer = {"name": "gpebo", "remedy": "current_coordinates"}
+        found = run(
+            one_state(A=[[a]]), observer=observer, estimator="least_squares",
+            excitation={"rho": rho}, time={"horizon": 1, "samples": 3},
+        ).details.excitation
+        assert found.t_c == pytest.approx(-np.log1p(-2 * a * rho) / (2 * a), rel=1e-9)
 
 
 @pytest.mark.parametrize("window", [4096, 3])  # elements that are looked at together

@@ -358,9 +358,11 @@ def test_outputs_have_names_units_and_rows():
     assert plant["C"] == [[1, 0, 0, 0], [1, -1, 0, 0], [0, 0, 1, -2], [1, 0, 1, 0], [0, -3, 0, 0]]
 
 
-def test_numbers_in_names_are_ordered_as_numbers():
+def test_nodes_are_ordered_by_numbers_and_may_be_called_as_elements():
     plant = plant_of("t\nV1 n1 0 1\nR1 n1 n10 1\nR2 n10 n2 1\nC10 n10 0 1\nC2 n2 0 1\n")
     assert plant["states"] == ["n1", "n2", "n10", "iv1"]
+    plant = plant_of("t\nV1 r1 0 1\nR1 r1 b 1\nC1 b 0 1\n", measure="v(r1)")
+    assert plant["states"] == ["b", "r1", "iv1"]  # and no current of R1
 
 
 def test_what_is_constant_has_no_derivative_and_a_resistor_may_start_from_nothing():
@@ -468,8 +470,9 @@ def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
 
 
 def test_what_continues_and_what_is_a_comment():
-    text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.end\nR1 a 0 2\n"
+    text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.save\n.end\nR1 a 0 2\n"
     netlist = read_netlist(text)
+    assert netlist.saved == []
     assert [(e.name, e.value) for e in netlist.elements.values()] == [("C1", 1.0), ("R1", 5.0)]
     assert netlist.title == "a title"
 
@@ -767,6 +770,9 @@ def test_to_xarray():
     np.testing.assert_array_equal(estimates["b_hat"].to_numpy()[0], table["b_hat"])
     assert result.to_xarray()["b"].attrs == {"units": "V"}
     assert estimates["e0_b_hat"].attrs == {"units": "V"}  # an initial error has its state's
+    plant = one_state(states=["v_true"], outputs=["v"], units={"v_true": "m", "v": "mm"})
+    signals = run(plant, observer="none", time={"horizon": 1.0}).to_xarray()
+    assert [signals[name].attrs["units"] for name in ("v_true", "v")] == ["m", "mm"]
 
 
 @pytest.mark.parametrize("package", ["control", "xarray"])
@@ -819,6 +825,7 @@ def test_files_of_matrices(tmp_path):
     folder.mkdir()
     for name, matrix in (("E", E), ("A", A), ("B", B), ("C", C)):
         mmwrite(folder / f"plant.{name}.mtx", sparse.coo_matrix(matrix))
+    (folder / "notes.mtx").write_text("what belongs to no system is passed over")
     expected = from_matrices({"E": E.toarray(), "A": A, "B": B, "C": C}, "p").mapping()
     assert {*expected["inputs"].values()} == {0.0}  # nobody has said what they are
     for path in (tmp_path / "a.mat", folder):

@@ -197,6 +197,11 @@ def test_rounding_of_Y_is_larger_in_what_is_told_less():
         knowledge(G[None], np.ones(2), np.ones(1)).doubt(G @ np.ones(2), across)[0][0]
         for G in (np.array([[1.0, c], [c, 1.0]]) for c in shares)
     ]
+    turned, sign = [], np.array([-1.0, 1.0])
+    for G in (np.array([[1.0, -c], [-c, 1.0]]) for c in shares):
+        known = knowledge(G[None], np.ones(2), np.ones(1))
+        turned.append(known.doubt(G @ sign, across * sign)[0][0])
+    np.testing.assert_allclose(turned, found, rtol=1e-9)
     expected = np.sqrt(2.0 * (1.0 + shares) / (1.0 - shares)) + np.sqrt(2.0)
     np.testing.assert_allclose(found / found[0], expected / expected[0], rtol=1e-9)
     alone = knowledge(np.eye(2)[None], np.ones(2), np.ones(1))
@@ -263,6 +268,7 @@ def test_what_is_seen_is_estimated_as_if_there_were_nothing_else(observer):
     for of, one, other in (
         (("hat", "std"), run(WHOLE, estimator="ls_drem", **given),
          run(ALONE, estimator="ls_drem", **given)),
+        (("hat",), *(run(plant, estimator="drem", gamma=1e6, **given) for plant in (WHOLE, ALONE))),
         (("hat",), run(WHOLE, estimator="gradient", gamma=gains, **given),
          run(WHOLE, estimator="gradient", gamma=100.0, **given)),
     ):

@@ -229,6 +229,12 @@ def test_a_held_signal_is_exact_on_its_mesh_and_edges_are_where_it_bends(hold):
 def test_rows_that_are_close_do_not_bend_a_line_by_rounding():
     t = np.cumsum(np.tile([1.0, 1e-6], 20))
     assert not bends(t, np.pi * t[:, None], "linear").any()
+    source, span = shipped("circuit").coefficients, (t[0], t[-1])
+    few, many = (
+        recording_mesh(at, np.pi * at[:, None], "linear", span, source, 1e-9).edges
+        for at in (t[[0, -1]], t)
+    )
+    np.testing.assert_array_equal(many, few)  # no row is an edge
 
 
 STEPPED = {

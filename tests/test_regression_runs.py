@@ -195,6 +195,12 @@ def test_why_there_is_no_deviation_knows_of_no_matrices(observer):
     assert "remedy" not in verdict
 
 
+def test_squares_that_are_no_numbers_are_refused():
+    large = {"name": "large", "unknowns": {"a": 1.0}, "psi": [["1e160*cos(t)"]]}
+    with pytest.raises(SolverError, match=r"ψᵀψ is too large for a number near t = 0; write Y and"):
+        run(regression=large, estimator="least_squares", time={"horizon": 2, "samples": 5})
+
+
 def test_arrays_by_name_and_what_can_be_checked(tmp_path):
     t = np.linspace(0.0, 10.0, 1001)
     measured = {**SINE, "signals": {"s": None, "y": None}, "Y": ["y"], "psi": [["s", 1]]}

@@ -188,7 +188,7 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
     ({"unknowns": {}}, "unknowns is missing"),
     ({"unknowns": 3}, "unknowns must map names to values"),
     ({"psi": [["u", "u"]]}, "psi[0] must be a list with an entry for each of the 1 unknowns (a)"),
-    ({"psi": []}, "psi must be a list"),
+    ({"psi": []}, "psi must be a list"), ({"psi": [3]}, "psi[0] must be a list with an entry"),
     ({"Y": ["u", "u"]}, "Y has 2 entries and psi has 1 rows"),
     ({"Y": ["lp(u)"]}, "lp takes two arguments, not 1"),
     ({"Y": ["lp(u, u)"]}, "its rate λ must be a positive number"),

@@ -545,6 +545,20 @@ def test_memory_is_carried_through_a_reset(settings_of_estimator):
     assert found.memory == pytest.approx(expected.memory, rel=1e-9)
 
 
+@pytest.mark.parametrize(("beta", "f0"), [(0.1, 1e3), (0.5, 1.0), (0.5, 1e-2)])
+def test_what_is_left_of_the_prior_of_a_state_is_told_where_data_are_forgotten(beta, f0):
+    """x' = 0 and ψ = 1: α G_z = (1 − e^(−β t))/β beside e^(−β t) f0."""
+    observer = {"name": "gpebo", "remedy": "current_coordinates"}
+    found = api_run(
+        one_state(A=[[0]]), observer=observer, estimator="least_squares", beta=beta, f0=f0,
+        time={"horizon": 3, "samples": 3},
+    ).details.estimation.requirement
+    ratio = np.expm1(3 * beta) / (beta * f0)
+    assert found.holds == (ratio > 99.0)
+    if not found.holds:
+        assert found.evidence["alpha_lambda_min_over_f0"] == pytest.approx(ratio, rel=1e-6)
+
+
 def test_filters_in_current_coordinates_hold_the_state():
     """Ωζ = 𝒴 for the true ζ, at every point, with rates that differ by row."""
     system, signals, observation = observed("mixed", remedy="current_coordinates")

@@ -697,6 +697,16 @@ def test_the_level_that_is_asked_for_is_reached_at_a_sample():
     assert found.t_c == reached[0] > found.t[1]
 
 
+def test_what_is_told_apart_but_never_well_is_exciting_since_then():
+    """N12 = 1 − 2e-7 at the end: from the third sample on that is no rounding."""
+    found = gpebo_cli.run(
+        regression={"name": "x", "unknowns": {"a": 1.0, "b": 2.0}, "psi": [["1", "1 + 1e-3*t"]]},
+        estimator="least_squares", observer={"sample_time": 0.1}, time={"horizon": 2, "samples": 5},
+    ).details.excitation
+    assert found.known.smallest[-1] < 1e-6
+    assert found.t_c == pytest.approx(0.2)
+
+
 def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
     """Before the first sample none of them has what it requires."""
     for name in estimators.names():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,6 +27,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
+from gpebo_cli.observers.remedies import reset
 from gpebo_cli.results.provenance import Provenance
 from gpebo_cli.results.report import run_lines
 from gpebo_cli.results.summary import summary
@@ -269,9 +271,11 @@ def test_of_a_recording_every_row_counts_as_one_error(times, hold, estimator, mo
     np.testing.assert_allclose(std, np.linalg.norm(each, axis=0)[known], rtol=1e-3)
 
 
-def test_what_errors_of_an_input_did_before_a_reset_stays_in_the_estimate():
+@pytest.mark.parametrize("unknowns", [{"k": 1}, {"k": 1, "without_effect": 1}])
+def test_what_errors_of_an_input_did_before_a_reset_stays_in_the_estimate(unknowns):
     """Of each row by itself; e₀ since a reset is about an estimate."""
-    plant = one_state(inputs={"u": 0}, unknowns={"k": 1}, A=[[-1]], B=[[1]], F=[[-1]])
+    plant = one_state(inputs={"u": 0}, unknowns=unknowns, A=[[-1]], B=[[1]],
+                      F=[[-1, 0][: len(unknowns)]])
     t = np.array([0.0, 0.7, 1.5, 3.0])
 
     def found(error):
@@ -646,6 +650,15 @@ def test_the_finite_time_law_is_as_uncertain_as_what_it_divides_by_makes_it(name
     assert np.ptp(left[:, 2:-2]) > 0.9
 
 
+def test_resets_that_do_not_say_what_errors_do_have_no_deviations(monkeypatch):
+    made = reset.Reset
+    monkeypatch.setattr(reset, "Reset", lambda *a, **more: replace(made(*a, **more), errors=None))
+    found = run("descriptor", observer={"name": "gpebo", "remedy": "reset", "reset_times": [1.0]},
+                noise=NOISE, time={"horizon": 2.0, "samples": 3})
+    assert found.details.estimation.parameters_std is None
+    assert "this remedy cannot tell" in found.verdict
+
+
 @pytest.mark.parametrize(("plant", "more", "why"), [
     ("descriptor", {"gamma": "logspace(0,2,33)"}, "each of 33 cases would take a pass of its own"),
     ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
@@ -689,10 +702,11 @@ def test_an_estimate_that_was_not_moved_has_no_deviation(tmp_path, observer, siz
         assert (np.abs(result.estimation.parameters[0, -1] - [1, 1e6, -1]) < 5 * std).all()
 
 
+@pytest.mark.parametrize("c", [1e3, -1e3])
 @pytest.mark.parametrize("gain", [1e8, 1e20, 1e32])
-def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain):
+def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain, c):
     """f' = −a f + e, s' = −g (s − c f): f as without s, and s goes to c f."""
-    a, c, h = 1e-4, 1e3, 0.4
+    a, h = 1e-4, 0.4
     A, B = np.array([[-a, 0.0], [gain * c, -gain]]), np.array([[1.0], [0.0]])
     mesh = Mesh(np.array([0.0, h]), radau_rule(4))
     A, B = (np.broadcast_to(each, (1, 4, *each.shape)) for each in (A, B))

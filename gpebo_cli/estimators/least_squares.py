@@ -150,14 +150,17 @@ class LeastSquares(ResumableEstimator):
         def extended(case: Mapping[str, float], before: ExtensionState | None) -> Array:
             """[F⁻¹ | 𝒴] at the times t, (M, p, p + 1)."""
             state = [before or ExtensionState(case.get("f0", 0.0) * prior, 0.0)]
-            found = filtered(
-                regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics, state
-            )
+            filters = regression.outer, case["beta"] * ones, case["alpha"] * ones, dynamics
+            found = filtered(*filters, state)
             reached.append(state_of(found, state))
-            gram = found(t)
-            # What the prior has in F⁻¹ at the end is the rest; where β > 0 it is soon forgotten.
-            plain = "f0" in case and not case["beta"] and regression.mesh.edges[-1] == last
-            from_data.append(case["alpha"] * whole.gram_final if plain else gram[-1])
+            gram = own = found(t)
+            # What the prior has in F⁻¹ at the end is the rest; of windows, β > 0 has forgotten it.
+            if "f0" in case and regression.mesh.edges[-1] == last:
+                if not case["beta"]:
+                    own = case["alpha"] * whole.gram_final[None]
+                elif regression is whole:
+                    own = filtered(*filters).final[None]
+            from_data.append(own[-1])
             if "f0" not in case:
                 energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
                 units = prior_units(energy, regression.terms(t), t - begin, rounding)

@@ -279,7 +279,7 @@ def after_reset(system: ErrorSystem, reset: Reset, known: ExtensionState | None)
     from which the estimator starts T δη̂ − V ζ. The system of its errors is that at the end of the
     segment, with ``known`` [Ω | 𝒴]; None: there is no extension.
     """
-    V, own = np.zeros((0, 0)) if reset.errors is None else reset.errors, system.A.shape[1]
+    V, own = np.asarray(reset.errors), system.A.shape[1]
     p, zeta = V.shape
     J = np.zeros((own, zeta + own))
     if known is not None:

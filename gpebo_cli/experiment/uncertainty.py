@@ -115,7 +115,9 @@ def standard_deviations(
     )
     if not regression.p:
         return ""
-    if errors is None or not isinstance(state_map, Differentiable):
+    if errors is None or not isinstance(state_map, Differentiable) or any(
+        reset.errors is None for reset in regression.resets
+    ):
         return IN_MATRICES
     needed = ResumableEstimator if regression.resets else Affine
     if not isinstance(estimator, Affine) or not isinstance(estimator, needed):
