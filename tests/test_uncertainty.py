@@ -334,6 +334,9 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
         f"does (observer.remedy=noise_free takes it out); or it suggests {WHY}")),
     ({"slow": True, "of_inputs": ("u",)}, (f": the residual{NOT}0.00, and a part of it is slow), "
                                            f"which noise of u does; or it suggests {WHY}")),
+    ({"slow": True, "fed_back": ("y",)}, (
+        f": the residual{NOT}0.00, and a part of it is slow), which noise of y does, which the "
+        f"observer feeds back (observer.form=strangeness_free does not); or it suggests {WHY}")),
     ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
         f": the residual, 1.00{TIMES}, is not white, that of least squares that weigh each output "
         "by its noise is: what is left says more of these estimates than of the model")),
@@ -377,6 +380,25 @@ def test_at_samples_matrices_may_follow_an_input_without_noise():
     noisy = NoiseSettings(name="gaussian", outputs=0.3, inputs=0.1)
     with pytest.raises(TypeError):  # there are none
         fed(system, law, t, u, y, "linear", noisy)
+
+
+@pytest.mark.parametrize(("form", "white"), [("auto", False), ("strangeness_free", True)])
+def test_noise_that_the_observer_feeds_back_is_no_fault_of_the_plant(form, white):
+    """v sees z, which is algebraic: the form as given takes z from its equation and from v."""
+    plant = {
+        "name": "fed", "states": ["x", "z"], "inputs": {"u": "sin(3*t)"}, "outputs": ["y", "v"],
+        "unknowns": {"b": 0.3}, "E": [[1, 0], [0, 0]], "A": [[-0.05, -1], [0.5, -1]],
+        "B": [[0], [1]], "F": [[1], [0]], "C": [[1, 0], [0, 1]], "initial_state": [1, 0],
+    }
+    made = run(plant, observer="none", time={"horizon": 20, "samples": 501})
+    random = np.random.default_rng(0)
+    noise = {name: made[name] + 0.05 * random.standard_normal(501) for name in ("y", "v")}
+    told = run(
+        plant, data={"t": made.t, "u": made["u"], **noise}, observer={"form": form},
+        estimator="least_squares",
+    ).verdict
+    assert ("up to white noise" in told) == white
+    assert ("noise of v does, which the observer feeds back" in told) != white
 
 
 @pytest.mark.parametrize("observer", [

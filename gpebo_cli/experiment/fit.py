@@ -209,6 +209,9 @@ def _explained(
         in_matrices=() if observation.errors is not None else tuple(
             name for name in system.outputs if name in system.followed
         ),
+        fed_back=() if observation.errors is None else tuple(compress(
+            system.outputs, observation.errors(t[-1:], t[-1:]).B[0][:, system.m :].any(axis=0)
+        )),
         of_inputs=tuple(compress(system.inputs, source.levels.noisy_inputs)),
         band=1.96 / np.sqrt((~off)[:, seen].sum()),
     )
