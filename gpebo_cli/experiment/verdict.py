@@ -106,7 +106,8 @@ def _explains(fit: Fit, case: int) -> str:
         )
         return (
             f": some samples are far from what explains the others, {', '.join(told)}, which "
-            "suggests gaps that are written as numbers (data.gaps), or a sensor that fails"
+            "suggests gaps that are written as numbers (data.gaps), a sensor that fails, or rows "
+            "too far apart for what moves there"
             f"{noise}{rest}"
         )
     if fit.ratio is not None and fit.ratio < _LESS:
