@@ -309,8 +309,8 @@ NOTHING = np.zeros(5)
 WHITE = ": the estimates explain the data up to white noise"
 NOT = " is not white (its correlation is "
 FAR = (": some samples are far from what explains the others, 24 of y (first at t = 0.14), which "
-       "suggests gaps that are written as numbers (data.gaps), a sensor that fails, or rows too far "
-       "apart for what moves there")
+       "suggests gaps that are written as numbers (data.gaps), a sensor that fails, or rows too "
+       "far apart for what moves there")
 
 
 @pytest.mark.parametrize(("fit", "said"), [
