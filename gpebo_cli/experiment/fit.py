@@ -160,7 +160,7 @@ def _explained(
     u, y = recording.inputs, recording.outputs
     own_t = t if source.own_t is None else source.own_t
     fitted = outputs(eta, t, own_t, u, y)
-    fit = replace(fit, outputs=fitted)
+    fit = replace(fit, outputs=np.where(_on(system, own_t, u, y), fitted, np.nan))
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
     if len(samples) < 2:
