@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from plants import one_state, shipped
 
+from gpebo_cli import run
 from gpebo_cli.errors import SolverError
 from gpebo_cli.experiment.noise import measure, noise_levels
 from gpebo_cli.experiment.pipeline import run_experiment
@@ -158,6 +159,14 @@ def test_what_still_changes_is_measured_by_the_residual():
     change = _change(SimpleNamespace(regression=exact), np.array([3.1]), np.array([3.0]), 1e-6)
     rounding = 1e-6 * (3.0 + 3.0) / 1e-3  # is no residual
     assert change == pytest.approx(0.1 / np.sqrt(2.0) / rounding, rel=0.02)
+
+
+def test_a_copy_that_cannot_be_followed_is_no_fault_of_the_file():
+    """Measured is y = 1, where x' = -1/y falls by 3: the copy passes zero, and y never does."""
+    plant = one_state(phi=["-1/y"], A=[[0]])
+    t = np.linspace(0.0, 3.0, 61)
+    with pytest.raises(SolverError, match=r"not settle; in round 1 .* divides by .* too large"):
+        run(plant, data={"t": t, "y": np.ones(61)}, observer={"remedy": "noise_free"})
 
 
 def test_a_copy_that_does_not_settle_is_refused(monkeypatch):

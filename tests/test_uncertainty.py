@@ -339,7 +339,8 @@ NOTHING = np.zeros(5)
 WHITE = ": the estimates explain the data up to white noise"
 NOT = " is not white (its correlation is "
 FAR = (": some samples are far from what explains the others, 24 of y (first at t = 0.14), which "
-       "suggests gaps that are written as numbers (data.gaps), or a sensor that fails")
+       "suggests gaps that are written as numbers (data.gaps), a sensor that fails, or rows too "
+       "far apart for what moves there")
 
 
 @pytest.mark.parametrize(("fit", "said"), [
@@ -364,6 +365,9 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
         f"does (observer.remedy=noise_free takes it out); or it suggests {WHY}")),
     ({"slow": True, "of_inputs": ("u",)}, (f": the residual{NOT}0.00, and a part of it is slow), "
                                            f"which noise of u does; or it suggests {WHY}")),
+    ({"slow": True, "fed_back": ("y",)}, (
+        f": the residual{NOT}0.00, and a part of it is slow), which noise of y does, which the "
+        f"observer feeds back (observer.form=strangeness_free does not); or it suggests {WHY}")),
     ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
         f": the residual, 1.00{TIMES}, is not white, that of least squares that weigh each output "
         "by its noise is: what is left says more of these estimates than of the model")),
@@ -409,6 +413,25 @@ def test_at_samples_matrices_may_follow_an_input_without_noise():
         fed(system, law, t, u, y, "linear", noisy)
 
 
+@pytest.mark.parametrize(("form", "white"), [("auto", False), ("strangeness_free", True)])
+def test_noise_that_the_observer_feeds_back_is_no_fault_of_the_plant(form, white):
+    """v sees z, which is algebraic: the form as given takes z from its equation and from v."""
+    plant = {
+        "name": "fed", "states": ["x", "z"], "inputs": {"u": "sin(3*t)"}, "outputs": ["y", "v"],
+        "unknowns": {"b": 0.3}, "E": [[1, 0], [0, 0]], "A": [[-0.05, -1], [0.5, -1]],
+        "B": [[0], [1]], "F": [[1], [0]], "C": [[1, 0], [0, 1]], "initial_state": [1, 0],
+    }
+    made = run(plant, observer="none", time={"horizon": 20, "samples": 501})
+    random = np.random.default_rng(0)
+    noise = {name: made[name] + 0.05 * random.standard_normal(501) for name in ("y", "v")}
+    told = run(
+        plant, data={"t": made.t, "u": made["u"], **noise}, observer={"form": form},
+        estimator="least_squares",
+    ).verdict
+    assert ("up to white noise" in told) == white
+    assert ("noise of v does, which the observer feeds back" in told) != white
+
+
 @pytest.mark.parametrize("observer", [
     {"name": "gpebo"}, {"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"},
 ])
@@ -428,7 +451,9 @@ def test_what_a_recording_has_of_an_output_that_is_off_tells_no_level(observer):
         each.details.estimation.parameters_std[0, -1, 0] for each in found.values()
     )
     np.testing.assert_allclose(long, short, rtol=0.02)
-    assert ("white noise" in found[10].verdict) == ("sample_time" not in observer)
+    if "sample_time" not in observer:
+        assert "white noise" in found[10].verdict
+        assert np.isnan(found[10].details.fit.outputs[found[10].t > 3.01]).all()  # no curve
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

@@ -160,7 +160,7 @@ def _explained(
     u, y = recording.inputs, recording.outputs
     own_t = t if source.own_t is None else source.own_t
     fitted = outputs(eta, t, own_t, u, y)
-    fit = replace(fit, outputs=fitted)
+    fit = replace(fit, outputs=np.where(_on(system, own_t, u, y), fitted, np.nan))
     samples = t if source.samples is None else source.samples
     samples = samples[(samples >= t[0]) & (samples <= t[-1])]
     if len(samples) < 2:
@@ -209,6 +209,9 @@ def _explained(
         in_matrices=() if observation.errors is not None else tuple(
             name for name in system.outputs if name in system.followed
         ),
+        fed_back=() if observation.errors is None else tuple(compress(
+            system.outputs, observation.errors(t[-1:], t[-1:]).B[0][:, system.m :].any(axis=0)
+        )),
         of_inputs=tuple(compress(system.inputs, source.levels.noisy_inputs)),
         band=1.96 / np.sqrt((~off)[:, seen].sum()),
     )

@@ -186,6 +186,7 @@ class Fit:
     least_white: bool = False  # whether that of weighed least squares is, where it is not
     of_inputs: tuple[str, ...] = ()  # inputs with noise, which the plant colours
     in_matrices: tuple[str, ...] = ()  # outputs, whose noise there is no error of Y
+    fed_back: tuple[str, ...] = ()  # outputs, whose noise moves the observer's state
     ratio: float | None = None  # of the residual to what the sensors' noise makes of it, √χ²/dof
 
     @property

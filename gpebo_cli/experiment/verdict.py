@@ -29,6 +29,7 @@ _FEW = 4.0  # the same where integrals of noise are all that is left: few indepe
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
+_NOT_FED_BACK = "observer.form=strangeness_free does not"
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
 
@@ -105,7 +106,8 @@ def _explains(fit: Fit, case: int) -> str:
         )
         return (
             f": some samples are far from what explains the others, {', '.join(told)}, which "
-            "suggests gaps that are written as numbers (data.gaps), or a sensor that fails"
+            "suggests gaps that are written as numbers (data.gaps), a sensor that fails, or rows "
+            "too far apart for what moves there"
             f"{noise}{rest}"
         )
     if fit.ratio is not None and fit.ratio < _LESS:
@@ -116,6 +118,7 @@ def _explains(fit: Fit, case: int) -> str:
         return f": the residual is white{noise}, which suggests a noisier sensor than was said"
     made = " or ".join(f"noise of {', '.join(names)} {does}" for names, does in (
         (fit.in_matrices, f"in the matrices does ({_TAKEN_OUT})"), (fit.of_inputs, "does"),
+        (fit.fed_back, f"does, which the observer feeds back ({_NOT_FED_BACK})"),
     ) if names)
     if fit.rounded:
         steps = ", ".join(f"{name} to steps of {step:.2g}" for name, step in fit.rounded)

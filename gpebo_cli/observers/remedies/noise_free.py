@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gpebo_cli.errors import SolverError
+from gpebo_cli.errors import GpeboError, SolverError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.mesh import Trajectory
@@ -46,7 +46,7 @@ class NoiseFree:
         for count in range(1, _MOST_ROUNDS + 1):
             try:
                 found = _round(reduced, found, eta)
-            except SolverError as error:
+            except GpeboError as error:  # along the measured signals there was none
                 raise _unsettled(count, str(error)) from error
             before, eta = eta, found.regression.least_squares()
             change = _change(found, before, eta, reduced.solver.tol, float(np.abs(y).max()))
