@@ -367,7 +367,8 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
                                            f"which noise of u does; or it suggests {WHY}")),
     ({"slow": True, "fed_back": ("y",)}, (
         f": the residual{NOT}0.00, and a part of it is slow), which noise of y does, which the "
-        f"observer feeds back (observer.form=strangeness_free does not); or it suggests {WHY}")),
+        "observer feeds back (observer.form=strangeness_free without a remedy does not); or it "
+        f"suggests {WHY}")),
     ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
         f": the residual, 1.00{TIMES}, is not white, that of least squares that weigh each output "
         "by its noise is: what is left says more of these estimates than of the model")),

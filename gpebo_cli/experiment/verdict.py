@@ -29,7 +29,7 @@ _FEW = 4.0  # the same where integrals of noise are all that is left: few indepe
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
-_NOT_FED_BACK = "observer.form=strangeness_free does not"
+_NOT_FED_BACK = "observer.form=strangeness_free without a remedy does not"
 _AMPLIFIED = 1e3  # times the tolerance: a simulation that is worse than that says so
 
 
