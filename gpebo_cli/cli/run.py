@@ -19,7 +19,7 @@ STDIN = "-"  # as data.file: rows are read from standard input, as they come
 
 
 def main(words: list[str]) -> int:
-    """Do what the words after ``gpebo run`` ask for; the exit code."""
+    """Do what the words after ``gpebo run`` ask for; the exit code (ConfigError)."""
     arguments = command_line.parse(words)
     from gpebo_cli.cli import composition
 
