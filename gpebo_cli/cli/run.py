@@ -28,7 +28,8 @@ def main(words: list[str]) -> int:
             return 0
         config, swept = composition.compose(hydra, arguments)
         own, other = ("sweep", "run") if swept else ("run", "sweep")
-        if any(word.lstrip("+").startswith(f"hydra.{other}.dir=") for word in arguments.overrides):
+        given = {word.lstrip("+").partition("=")[0] for word in arguments.overrides}
+        if f"hydra.{other}.dir" in given and f"hydra.{own}.dir" not in given:
             raise ConfigError(
                 f"hydra.{other}.dir: the folder of this {own} is given by hydra.{own}.dir=FOLDER"
             )
