@@ -351,7 +351,7 @@ def test_bounds_hold_on_both_sides_of_a_jump(u):
     )
     result = run(
         plant, observer={"bounds": {"states": {"z": [-0.3, None]}}}, estimator="least_squares",
-        time={"horizon": 2, "samples": 2001},
+        time={"horizon": 2, "samples": 201},
     )
     assert result.estimates["z"].min() > -0.3 - 1e-6
 

@@ -482,6 +482,25 @@ def test_a_filter_that_is_very_fast_follows_on_few_elements(elements):
     assert found.mesh.size < 150  # X₁ grows by exp(60,000)
 
 
+def test_a_direction_that_is_measured_almost_exactly_stays_apart_from_the_other():
+    """A, Q and c are turned by one angle, and so is P: its directions are never correlated."""
+    R = np.array([[np.cos(0.7), -np.sin(0.7)], [np.sin(0.7), np.cos(0.7)]])
+    A, Q = (R @ np.diag(each) @ R.T for each in ([-0.3, -0.5], [0.1, 0.2]))
+
+    def model(t, inside):
+        z, zero = 1.0 + 0.0 * t[:, None, None], np.zeros((1, 2, 1))
+        V = np.full((1, 1, 1), 1e-10)
+        return StateSpace(A[None], zero, R.T[None, :1], z, Q[None], zero, V), ()
+
+    mesh = initial_mesh(0.0, 2.0, [], 5, radau_rule(14))
+    found = run_filter(model, np.zeros((2, 1)), np.eye(2), mesh, tol=1e-9, max_elements=1000)
+    own = R.T @ found.at(np.array([1.0, 2.0]))[0] @ R
+    assert np.abs(own[:, 0, 1] / np.sqrt(own[:, 0, 0] * own[:, 1, 1])).max() < 1e-12
+    settled = 1e-10 * (-0.3 + np.sqrt(0.09 + 0.1 / 1e-10))
+    np.testing.assert_allclose(own[:, 0, 0], settled, rtol=1e-10)
+    np.testing.assert_allclose(own[:, 1, 1], 0.2 + 0.8 * np.exp([-1.0, -2.0]), rtol=1e-6)
+
+
 def test_a_very_fast_filter_of_many_states_is_that_of_the_linear_equation(monkeypatch):
     """States in other units, noises that are correlated, signals that jump, measured twice."""
     random = np.random.default_rng(5)
