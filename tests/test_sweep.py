@@ -185,13 +185,13 @@ def test_what_keeps_a_job_from_its_record_is_said_of_that_job(tmp_path):
 
 
 def test_fail_fast_stops_at_the_first_and_the_rest_can_be_run_later(tmp_path):
-    words = ["run", "-m", "estimator.gamma=1e6,-1,1e8", *FAST]
-    done = gpebo(*words, "hydra.sweep.dir=sweep", "hydra.run.dir=one", "fail_fast=true", cwd=tmp_path)
+    words = ["run", "-m", "estimator.gamma=1e6,-1,1e8", "hydra.run.dir=one", *FAST]
+    done = gpebo(*words, "hydra.sweep.dir=sweep", "fail_fast=true", cwd=tmp_path)
     assert done.returncode == 1
     assert "1 of 3 jobs failed: job 1: estimator.gamma" in done.stderr
     assert "1 job without a result (fail_fast); go on with resume=sweep" in done.stderr
     assert [row["status"] for row in rows(tmp_path / "sweep")] == ["done", "failed", "missing"]
-    again = gpebo(*words, "resume=sweep", cwd=tmp_path)
+    again = gpebo(*words, "hydra.sweep.dir=sweep", "resume=sweep", cwd=tmp_path)
     assert not (tmp_path / "outputs").exists()
     assert again.returncode == 1
     assert again.stderr.count("\n") == 1
