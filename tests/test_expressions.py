@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 import warnings
 from collections.abc import Callable
@@ -325,7 +326,8 @@ HOSTILE = {
     "power tower that parses": "**".join(["1.0"] * 400),
     "large power": "10.0**10**10",
     "large integer power": "10**400",
-    "long sum": "+".join(["t"] * 5_000),
+    # Python 3.13 and later take it.
+    **({"long sum": "+".join(["t"] * 5_000)} if sys.version_info < (3, 13) else {}),
     "large integer": "9" * 5_000,
     "large integer below the limit": "9" * 4_000,
     "large float": "1e400",
