@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -164,7 +165,8 @@ def _matrix_market(folder: Path) -> dict[str, Any]:
                     f"{path} has {size} bytes with {rows} × {columns} entries; at most {MAX_BYTES} "
                     f"bytes and {MAX_STATES} rows and columns are read"
                 )
-            found[match[1]] = mmread(path)
+            with warnings.catch_warnings(action="ignore"):  # any of SciPy's two kinds of sparse
+                found[match[1]] = mmread(path)
         except (ValueError, OverflowError) as error:
             raise ConfigError(f"{path} is no Matrix Market file ({error})") from None
     if "A" not in found:
