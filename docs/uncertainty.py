@@ -93,7 +93,7 @@ def errors_over_seeds(
             own.append(np.concatenate([eta, offset + gain @ eta], axis=1))
     for own, estimator in zip(found, built, strict=True):
         deviations = standard_deviations(
-            observation, estimator, source, t, source.states(t)[None]
+            observation, estimator, source, t, source.states(t)[None], system
         )
         if isinstance(deviations, str):
             raise TypeError(f"{estimator} has no deviations: {deviations}")

@@ -435,6 +435,7 @@ def test_noise_that_the_observer_feeds_back_is_no_fault_of_the_plant(form, white
 
 @pytest.mark.parametrize("observer", [
     {"name": "gpebo"}, {"name": "gpebo", "sample_time": 0.05}, {"name": "kalman_bucy"},
+    {"name": "gpebo", "form": "strangeness_free", "remedy": "output_injection"},
 ])
 def test_what_a_recording_has_of_an_output_that_is_off_tells_no_level(observer):
     """It is on for 3 of 10 s: what it shows then is all there is, zeros afterwards or not."""

@@ -33,7 +33,6 @@ from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
 from gpebo_cli.experiment.uncertainty import (
-    IN_MATRICES,
     none_at_samples,
     residual_ratio,
     sampled_deviations,
@@ -117,7 +116,7 @@ def continuous(
     if source.noisy or observation.estimator is not None:
         with stage("uncertainty"):
             estimation, why = _with_deviations(
-                settings, observation, estimator, source, known, estimation
+                settings, observation, estimator, source, known, estimation, system
             )
     fit = fit_of(observation, estimation, system, source) if source.recording else None
     if fit is not None and settings.uncertainty:
@@ -141,7 +140,7 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why, system),
+        _gains(observation, estimation), _no_deviations(why),
     )
 
 
@@ -178,7 +177,7 @@ def _completed(
 
 def _with_deviations(
     settings: Settings, observation: Observation, estimator: estimators.Estimator, source: Source,
-    known: Knowledge, estimation: EstimationResult,
+    known: Knowledge, estimation: EstimationResult, system: DescriptorSystem,
 ) -> tuple[EstimationResult, str]:
     """With standard deviations, or why there are none (not, if nobody asked)."""
     if isinstance(observation.state_map, Filtering):
@@ -189,7 +188,7 @@ def _with_deviations(
         return estimation, ""
     found, columns = observation.about(known.independent, lambda some, columns: standard_deviations(
         replace(observation, regression=some), estimator, source, estimation.t, estimation.states,
-        columns,
+        system, columns,
     ))
     if isinstance(found, str):
         return estimation, found
@@ -288,7 +287,7 @@ def at_samples(
     told = np.concatenate([parameters, states], axis=2)[:, kept]
     std, gains, why = made.at(kept, ~np.isnan(told), still)
     if settings.uncertainty and parameters.size and std is None:
-        why = why or none_at_samples(len(online.cases))
+        why = why or none_at_samples(len(online.cases), system)
     estimation = EstimationResult(
         cases=online.cases, t=t[kept], names=online.parameters, parameters=parameters[:, kept],
         true_parameters=truth[kept], states=states[:, kept],
@@ -317,13 +316,11 @@ def at_samples(
     return _completed(
         found, source, online, [name for name, since in times.items() if since is None],
         excitation, estimation, metrics, gains,
-        _no_deviations(why, system) if source.noisy else _held(samples, metrics),
+        _no_deviations(why) if source.noisy else _held(samples, metrics),
     )
 
 
-def _no_deviations(why: str, system: DescriptorSystem) -> str:
-    if system.regression is not None:  # it has no matrices and no remedies
-        why = why.replace(IN_MATRICES, "noise of the signals is in ψ")
+def _no_deviations(why: str) -> str:
     return f"; no standard deviations: {why}" if why else ""
 
 

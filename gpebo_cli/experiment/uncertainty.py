@@ -10,7 +10,7 @@ from gpebo_cli.evidence.sampled_uncertainty import SampledDeviations
 from gpebo_cli.evidence.uncertainty import deviations, noise_level
 from gpebo_cli.experiment.noise import NoiseLevels, signal_noise
 from gpebo_cli.experiment.sources import Source
-from gpebo_cli.model.descriptor import Array, IntArray
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers._base import Differentiable, Observation
 from gpebo_cli.regression.errors import ErrorsAt
@@ -27,7 +27,7 @@ _ROUNDING = (
     "the estimate"
 )
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
-IN_MATRICES = (
+_IN_MATRICES = (
     "noise of the signals is in the matrices (of outputs observer.remedy=noise_free takes it out) "
     "or differentiated, or this remedy cannot tell what it does"
 )
@@ -62,9 +62,14 @@ def sampled_deviations(
     return SampledDeviations(variances, row, relative=levels.silent, between=between)
 
 
-def none_at_samples(cases: int) -> str:
+def none_at_samples(cases: int, system: DescriptorSystem) -> str:
     """Why an observer and an estimator at samples have no deviations."""
-    return _MANY.format(cases) if cases > MOST_CASES else f"{IN_MATRICES}, or {_NOT_SAID}"
+    return _MANY.format(cases) if cases > MOST_CASES else f"{_unclear(system)}, or {_NOT_SAID}"
+
+
+def _unclear(system: DescriptorSystem) -> str:
+    """Why nobody knows what noise does; a regression has no matrices and no remedies."""
+    return _IN_MATRICES if system.regression is None else "noise of the signals is in ψ"
 
 
 def residual_ratio(observation: Observation, source: Source) -> float | None:
@@ -100,7 +105,7 @@ def _variances(levels: NoiseLevels) -> Array:
 
 def standard_deviations(
     observation: Observation, estimator: Estimator, source: Source, t: Array, states: Array,
-    columns: IntArray | slice = slice(None),
+    system: DescriptorSystem, columns: IntArray | slice = slice(None),
 ) -> tuple[Array, Array] | str:
     """Deviations of parameters (G, M, p) and ``states`` (G, M, n) at t (M,), or why there are none.
 
@@ -118,7 +123,7 @@ def standard_deviations(
     if errors is None or not isinstance(state_map, Differentiable) or any(
         reset.errors is None for reset in regression.resets
     ):
-        return IN_MATRICES
+        return _unclear(system)
     needed = ResumableEstimator if regression.resets else Affine
     if not isinstance(estimator, Affine) or not isinstance(estimator, needed):
         return _NOT_SAID

@@ -73,6 +73,7 @@ def refine(
         if stuck.sum() > max(_SOME, 0.02 * mesh.size):
             away = np.where(np.isin(mesh.edges, list(fixed)), 0.0, 64 * EPS)
             moved = replace(mesh, edges=mesh.edges + away * np.abs(mesh.edges).max())
+            # Elements that are fine are not judged by it, and not solved again.
             there, other = evaluate(moved, found, np.where(poor, -1, np.arange(mesh.size)))
             change = np.abs(other / np.maximum(tail, EPS) - 1.0)
             if np.mean(np.minimum(change[stuck], 1.0)) > _OTHER:

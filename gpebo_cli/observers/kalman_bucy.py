@@ -101,30 +101,30 @@ class KalmanBucy:
         # What is known at the start counts as what is least known.
         sizes = np.concatenate([known.form.units.unknowns, known.units])
         varies = np.where(variances > 0.0, variances, sizes**2 * (variances / sizes**2).max())
-        plant = _Plant(known, _steps(noise, mesh), sizes, NoiseModel(
+        followed = _Followed(known, _steps(noise, mesh), sizes, NoiseModel(
             noise.variances * noise.sample_time,
             per_name(self.process, names, "estimate", "observer.process", absent=0.0),
             self.regularisation**2 * noise.sample_time * varies,
         ))
         start = np.append(np.zeros(system.q), known.first.split.dual @ known.xi_a)
-        P0, (floor, regularised) = _initial_covariance(variances, known), plant.rounding(windows)
+        P0, (floor, regularised) = _initial_covariance(variances, known), followed.rounding(windows)
         parts = filter_windows(
-            plant.model, start[:, None], P0, windows, tol=solver.tol,
-            max_elements=solver.max_elements, monitor=plant.monitor, floor=floor / solver.tol,
+            followed.model, start[:, None], P0, windows, tol=solver.tol,
+            max_elements=solver.max_elements, monitor=followed.monitor, floor=floor / solver.tol,
             sizes=sizes, name=f"Kalman-Bucy filter of plant {system.name}",
         )
         filtered = next(parts) if len(windows) == 1 else _kept(parts, mesh, signals.wanted)
         if few is not None:
-            filtered = _along_all(filtered, signals, few, solver, plant.errors(filtered))
+            filtered = _along_all(filtered, signals, few, solver, followed.errors(filtered))
         gramians = window_gramians(
-            plant.information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
+            followed.information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
             max_elements=solver.max_elements,
         )
         observability = _uniform_observability(gramians, P0, known, sizes)
         note = evidence.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
         intensities = (f"intensity_{name}" for name in (*system.inputs, *system.outputs))
         used: dict[str, float | int | str | None] = dict(
-            zip(intensities, plant.noise.signals.tolist(), strict=True)
+            zip(intensities, followed.noise.signals.tolist(), strict=True)
         )
         if regularised:
             share = f"{self.regularisation:g} of each equation's own under P0"
@@ -151,13 +151,13 @@ class KalmanBucy:
             growth=None,
             estimator=Filter(filtered, observability),
             names=names,
-            evidence=evidence, drifts=bool(plant.noise.process.any()),
+            evidence=evidence, drifts=bool(followed.noise.process.any()),
             note=note,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class _Plant:
+class _Followed:
     """What the filter follows, as functions of time t (N,); see :class:`FilterModel`."""
 
     known: ReducedSystem
