@@ -51,8 +51,8 @@ def begin(*words: object, cwd: Path, **more: str) -> subprocess.Popen[str]:
 
 
 def wait_for(folder: Path, pattern: str, count: int = 1) -> None:
-    """Until there are as many such files in a folder, for a minute at most."""
-    deadline = monotonic() + 60
+    """Until there are as many such files in a folder, for three minutes at most."""
+    deadline = monotonic() + 180
     while len(list(folder.glob(pattern))) < count and monotonic() < deadline:
         sleep(0.005)
 

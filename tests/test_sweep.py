@@ -12,6 +12,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from examples import gpebo
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobReturn, JobStatus
 from hypothesis import example, given, settings
@@ -19,7 +20,6 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from plants import DECAYING
 from processes import assert_refused, begin, printed, refused, rows_of, wait_for
-from processes import process as gpebo
 from scipy.integrate import trapezoid
 
 from gpebo_cli import run

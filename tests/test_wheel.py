@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from processes import printed
+from processes import printed, wait_for
 
 from gpebo_cli import __version__, kernels
 
@@ -22,28 +22,42 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wheel")
+def made(tmp_path_factory):
+    """A folder with the wheel and with `site`, made once for all workers of these tests."""
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    folder = folder / "wheel"
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        wait_for(folder, "unpacked")
+        return folder
     subprocess.run(
         [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", folder, ROOT],
         check=True, capture_output=True,
     )
-    (path,) = folder.glob("*.whl")
+    subprocess.run(
+        [
+            sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
+            "--disable-pip-version-check", "--target", folder / "site", *folder.glob("*.whl"),
+        ],
+        check=True, capture_output=True,
+    )
+    (folder / "unpacked").touch()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(made):
+    (path,) = made.glob("*.whl")
     return path
 
 
 @pytest.fixture(scope="module")
-def installed(wheel, tmp_path_factory):
+def installed(made):
     """The wheel unpacked as pip would, without its dependencies, which are here already."""
-    folder = tmp_path_factory.mktemp("site")
-    subprocess.run(
-        [
-            sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
-            "--disable-pip-version-check", "--target", folder, wheel,
-        ],
-        check=True, capture_output=True,
-    )
-    return folder
+    return made / "site"
 
 
 @pytest.fixture
