@@ -281,16 +281,14 @@ def per_name(
     """
     import numpy as np
 
-    known = f"the {noun}s are {', '.join(names) or 'none'}"
+    there = f"the {noun}s are"
     if isinstance(value, Mapping):
         for key in value:
             if key not in names:
-                raise ConfigError(
-                    f"{where}: there is no {noun} {key!r}; {known}" + nearest(str(key), names)
-                )
+                raise unknown(f"{where}: there is no {noun} {key!r}", key, names, there)
         missing = [name for name in names if name not in value]
         if missing and absent is None:
-            raise ConfigError(f"{where}: no value for {missing[0]!r}; {known}")
+            raise ConfigError(f"{where}: no value for {missing[0]!r}; {there} {', '.join(names)}")
         given = [value.get(name, absent) for name in names]
     elif isinstance(value, Sequence) and not isinstance(value, str):
         if len(value) != len(names):
