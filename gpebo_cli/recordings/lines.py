@@ -19,7 +19,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.schema import LARGEST, nearest, shown, unknown
+from gpebo_cli.schema import LARGEST, known_name, nearest, shown
 from gpebo_cli.settings import DataSettings
 
 TIME = "t"
@@ -97,9 +97,8 @@ def read_header(
     signals = (TIME, *system.inputs, *system.outputs)
     for key, given in (("columns", columns), ("scale", scale)):
         for name in given:
-            if name not in (*signals, *system.states):
-                what = f"data.{key}: {shown(name)} is no signal of plant {system.name}"
-                raise unknown(what, name, (*signals, *system.states), "those are")
+            what = f"data.{key}: {shown(name)} is no signal of plant {system.name}"
+            known_name(name, (*signals, *system.states), what, "those are")
     for name, factor in scale.items():
         if not 0.0 < abs(factor) < np.inf:
             raise ConfigError(f"data.scale.{name} must be a finite number other than 0")
