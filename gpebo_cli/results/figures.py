@@ -67,10 +67,8 @@ def regressor(result: RunResult) -> list[Panel]:
                   f"for {typeset(name, labels)}")
             for column, name in enumerate(regression.parameters)
         )
-        name, text = f"ψ, row {row + 1}", rf"$\psi$, row {row + 1}"
-        if len(rows) == 1:
-            name, text = "regressor ψ", r"regressor $\psi$"
-        panels.append(Panel(name, curves, text=text))
+        name = f"ψ, row {row + 1}" if len(rows) > 1 else "regressor ψ"
+        panels.append(Panel(name, curves, text=name.replace("ψ", r"$\psi$")))
     return _with_legend(panels)
 
 
