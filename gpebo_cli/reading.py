@@ -13,8 +13,7 @@ from gpebo_cli.errors import ConfigError
 def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
     """Open a regular file for reading: a device has no end, and a pipe may never begin.
 
-    Raises:
-        ConfigError: the file cannot be opened, or is a folder, a pipe, a socket or a device.
+    ConfigError: the file cannot be opened, or is a folder, a pipe, a socket or a device.
     """
     try:
         # Without O_NONBLOCK, opening a pipe waits until somebody writes to it.

@@ -47,14 +47,9 @@ class Registry(Generic[T]):
         return frozenset(path.stem for path in modules if path.stem[0] != "_")
 
     @property
-    def group(self) -> str:
-        """The entry points under which other packages offer theirs."""
-        return f"gpebo.{self.noun}s"
-
-    @property
     def theirs(self) -> dict[str, EntryPoint]:
         """Those that installed packages bring. A name of ours is ours."""
-        return {entry.name: entry for entry in entry_points(group=self.group)}
+        return {entry.name: entry for entry in entry_points(group=f"gpebo.{self.noun}s")}
 
     def names(self) -> list[str]:
         """All there are, those of other packages included."""

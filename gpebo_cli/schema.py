@@ -55,6 +55,13 @@ def unknown(what: str, given: object, known: Iterable[str], there: str = "known:
     return ConfigError(f"{what}; {there} {', '.join(names) or 'none'}{nearest(str(given), names)}")
 
 
+def known_name(name: T, known: Collection[str], what: str, there: str = "known:") -> T:
+    """``name``, one of those that are known, or an error as of :func:`unknown` (ConfigError)."""
+    if name not in known:
+        raise unknown(what, name, known, there)
+    return name
+
+
 def check_keys(given: Iterable[object], known: Collection[str], where: str) -> None:
     """Refuse a key of a file that is not among those that are known (ConfigError)."""
     for key in given:
@@ -121,8 +128,7 @@ def read(cls: type[T], mapping: object, where: str) -> T:
     hints = _hints(cls)  # annotations are text, which is compiled to read it
     by_key, known = _by_key(cls), keys(cls)
     for key in mapping:
-        if key not in known:
-            raise unknown(f"{where}.{key}: no such key", key, known, f"{where} has")
+        known_name(key, known, f"{where}.{key}: no such key", f"{where} has")
     values: dict[str, Any] = {}
     for key, field in by_key.items():
         if "one_of" in field.metadata:
@@ -281,16 +287,13 @@ def per_name(
     """
     import numpy as np
 
-    known = f"the {noun}s are {', '.join(names) or 'none'}"
+    there = f"the {noun}s are"
     if isinstance(value, Mapping):
         for key in value:
-            if key not in names:
-                raise ConfigError(
-                    f"{where}: there is no {noun} {key!r}; {known}" + nearest(str(key), names)
-                )
+            known_name(key, names, f"{where}: there is no {noun} {key!r}", there)
         missing = [name for name in names if name not in value]
         if missing and absent is None:
-            raise ConfigError(f"{where}: no value for {missing[0]!r}; {known}")
+            raise ConfigError(f"{where}: no value for {missing[0]!r}; {there} {', '.join(names)}")
         given = [value.get(name, absent) for name in names]
     elif isinstance(value, Sequence) and not isinstance(value, str):
         if len(value) != len(names):

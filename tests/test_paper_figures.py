@@ -464,7 +464,7 @@ def test_the_tables_are_small() -> None:
     ("words", "message"),
     [
         (["paper_circut"], "no recipe 'paper_circut'; known: .*did you mean paper_circuit"),
-        (["figures.formats=[jpg]"], "expected some of png, pdf, svg"),
+        (["figures.formats=[jpg]"], "expected png or pdf or svg, got .jpg.; did you mean png"),
         (["--ouput=x"], "'--ouput' is no option; .*did you mean --output"),
         (["--output"], "--output needs a folder"),
         (["--check", "nowhere"], "--check nowhere: there is no such folder"),

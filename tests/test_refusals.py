@@ -48,6 +48,10 @@ def canonical(**changes):
         ({"data": {"name": "csv", "file": "-"}}, "standard input is for gpebo run"),
         ({"data": ROWS[:1]}, "data has 1 rows; at least 2"),
         (
+            {"data": {"frame": ROWS[:0].astype({"t": object}), "time_unit": "datetime"}},
+            "data has 0 rows; at least 2",
+        ),
+        (
             {"data": {"name": "csv", "frame": ROWS.where(ROWS > 0.5), "missing": "drop"}},
             "data has 1 rows without gaps; 2",
         ),

@@ -705,4 +705,4 @@ def test_a_pipe_among_the_files_of_a_run_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a" / "cases.csv")
     done = gpebo("compare", "a", cwd=tmp_path)
     assert done.returncode != 0
-    assert "a/cases.csv: not a regular file" in done.stderr
+    assert "a/cases.csv is not a regular file" in done.stderr

@@ -25,7 +25,7 @@ from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.recordings.drive import located
 from gpebo_cli.regression.text import system_from_mapping
-from gpebo_cli.schema import nearest, plain, shown, unknown
+from gpebo_cli.schema import known_name, nearest, plain, shown
 from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 
 if TYPE_CHECKING:
@@ -214,8 +214,7 @@ def available(
     """
     if group is None:
         return {name: available(name, config_dir) for name in GROUPS}
-    if group not in GROUPS:
-        raise unknown(f"available({shown(group)}): no such group", group, GROUPS)
+    known_name(group, GROUPS, f"available({shown(group)}): no such group")
     return sorted({
         name for folder in folders(config_dir) for name in choices(folder, group, inside=True)
     })

@@ -19,8 +19,7 @@ from gpebo_cli.results.tables import frame
 def to_xarray(result: RunResult, table: str) -> Any:
     """A table of a run as an ``xarray.Dataset``, with the plant's units.
 
-    Raises:
-        ConfigError: no such table, or xarray is not installed.
+    ConfigError: no such table, or xarray is not installed.
     """
     _package("xarray")
     found = frame(result, table).to_xarray()
@@ -35,9 +34,7 @@ def to_xarray(result: RunResult, table: str) -> Any:
 def to_control(result: RunResult) -> Any:
     """The observer of a time-invariant plant as a ``control.StateSpace`` from [u; y; θ] to x̂.
 
-    Raises:
-        ConfigError: another observer, a plant that varies with time, or python-control is not
-            installed.
+    ConfigError: another observer, a plant that varies with time, or python-control is missing.
     """
     control = _package("control")
     system, settings = result.system, result.settings

@@ -17,7 +17,7 @@ from gpebo_cli.cli import options
 from gpebo_cli.cli.options import PLAIN, Options
 from gpebo_cli.configs.locations import GROUPS, LOOK, PRIMARY, choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import convert, shown, unknown
+from gpebo_cli.schema import convert, known_name, shown
 
 VALUES = {
     "--cfg": ("job", "hydra", "all"),
@@ -148,8 +148,7 @@ def _stored(word: str) -> str:
     match = re.match(r"\+*figures\.([^=]*)=", word)
     if match is None:
         return word
-    if match[1] not in LOOK:
-        raise unknown(f"figures.{match[1]}: no such key", match[1], LOOK, "figures has")
+    known_name(match[1], LOOK, f"figures.{match[1]}: no such key", "figures has")
     return word.replace("figures.", "output.", 1)
 
 
@@ -209,8 +208,6 @@ def _resume(given: str | None) -> str | None:
 
 def _config_name(given: str | None, config_dir: str | None) -> str:
     name = PRIMARY if given is None else given.removesuffix(".yaml")
-    known = Arguments(config_dir=config_dir).known("")
-    if name in known:
-        return name
     where = "" if config_dir is None else f" in {config_dir}"
-    raise unknown(f"--config-name {name}: there is no {name}.yaml{where}", name, known)
+    what = f"--config-name {name}: there is no {name}.yaml{where}"
+    return known_name(name, Arguments(config_dir=config_dir).known(""), what)

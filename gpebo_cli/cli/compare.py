@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from gpebo_cli.cli.options import parse
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.results.report import columns
-from gpebo_cli.schema import unknown
+from gpebo_cli.schema import known_name
 
 if TYPE_CHECKING:
     from gpebo_cli.results.comparison import Value
@@ -44,8 +44,7 @@ def main(words: list[str]) -> int:
     known = comparison.names(cases)
     asked = [n.strip() for n in arguments.values.get("--columns", "").split(",") if n.strip()]
     for option, name in (("--sort", sort), *(("--columns", name) for name in asked)):
-        if name not in known:
-            raise unknown(f"{option} {name}: no such column", name, known)
+        known_name(name, known, f"{option} {name}: no such column")
     cases = comparison.ordered(cases, sort, reverse="--reverse" in arguments.switches)
     rows = [comparison.row(case) for case in cases]
 

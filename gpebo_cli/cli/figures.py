@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +12,9 @@ from gpebo_cli.cli.arguments import NO_WORDS, Arguments
 from gpebo_cli.cli.options import CONFIG_DIR, VOLUME, no_option, parse
 from gpebo_cli.configs.locations import PRIMARY
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.schema import convert, counted, shown, unknown
+from gpebo_cli.results.names import FORMATS
+from gpebo_cli.schema import convert, counted, known_name, read, shown
+from gpebo_cli.settings import OutputSettings
 
 if TYPE_CHECKING:
     from hydra.core.config_loader import ConfigLoader
@@ -80,29 +82,17 @@ def _asked(arguments: Arguments) -> tuple[list[str], list[str]]:
         elif equals and key != "experiment":
             raise no_option("figures", key, (*_FOLDERS, *CONFIG_DIR, _FORMATS))
         else:
-            names.append(known_recipe("figures", word.removeprefix("experiment="), known))
+            names.append(word.removeprefix("experiment="))
+            what = f"gpebo figures: there is no recipe {shown(names[-1])}"
+            known_name(names[-1], known, what)
     return list(dict.fromkeys(names)), formats
-
-
-def known_recipe(command: str, name: str, known: Sequence[str]) -> str:
-    """``name``, one of the known recipes (ConfigError: it is none of them)."""
-    if name not in known:
-        raise unknown(f"gpebo {command}: there is no recipe {shown(name)}", name, known)
-    return name
 
 
 def _formats(text: str) -> list[str]:
     """``[png,pdf]`` or ``pdf``; PNG is always among them, for the page shows it."""
-    from gpebo_cli.results.names import FORMATS
-
     given = [part.strip() for part in text.strip("[] ").split(",")]
-    for name in given:
-        if name not in FORMATS:
-            raise ConfigError(
-                f"{_FORMATS}: expected some of {', '.join(FORMATS)}, as in "
-                f"{_FORMATS}=[png,pdf]; got {shown(name)}"
-            )
-    return [name for name in FORMATS if name == "png" or name in given]
+    asked = read(OutputSettings, {"formats": given}, "figures").formats
+    return [name for name in FORMATS if name == "png" or name in asked]
 
 
 def run_recipes(names: list[str], arguments: Arguments = NO_WORDS) -> Iterator[Recipe]:

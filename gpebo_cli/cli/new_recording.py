@@ -15,7 +15,7 @@ from gpebo_cli.errors import ConfigError, printable
 from gpebo_cli.recordings.guess import Guess, guess
 from gpebo_cli.regression.text import system_from_mapping
 from gpebo_cli.results.files import make_folder, write_text
-from gpebo_cli.schema import unknown
+from gpebo_cli.schema import known_name
 
 _WORDS = {"\t": "tab", " ": "space"}
 
@@ -23,8 +23,7 @@ _WORDS = {"\t": "tab", " ": "space"}
 def write(file: str, plant: str, folder: str) -> int:
     """Write ``folder/data/NAME.yaml`` for a recording of a plant; the exit code (ConfigError)."""
     names = {name: home for home in (folder, conf_folder()) for name in choices(home, "plant")}
-    if plant not in names:
-        raise unknown(f"--plant {plant}: there is no such plant", plant, sorted(names))
+    known_name(plant, sorted(names), f"--plant {plant}: there is no such plant")
     file_of_plant = os.path.join(names[plant], "plant", f"{plant}.yaml")
     system = system_from_mapping(files.load(names[plant], f"plant/{plant}"), file_of_plant)
     found = guess(file, system)

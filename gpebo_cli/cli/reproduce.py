@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpebo_cli.cli.arguments import NO_WORDS, Arguments
-from gpebo_cli.cli.figures import known_recipe, recipe_jobs, run_recipe_job
+from gpebo_cli.cli.figures import recipe_jobs, run_recipe_job
 from gpebo_cli.cli.options import PLAIN, VOLUME, Options, parse
 from gpebo_cli.configs.locations import choices, conf_folder
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.schema import counted, read, shown
+from gpebo_cli.schema import counted, known_name, read, shown
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import RunResult
@@ -61,8 +61,9 @@ def main(words: list[str]) -> int:
     page = options.values.get("--page")
     pictures = None if page is None else Path(page).parent / _PICTURES
     known = choices(conf_folder(), FOLDER)
-    names = [known_recipe("reproduce", name, known) for name in options.words] or known
-    findings = [f for name in names for f in reproduced(name, options, pictures)]
+    for name in options.words:
+        known_name(name, known, f"gpebo reproduce: there is no recipe {shown(name)}")
+    findings = [f for name in options.words or known for f in reproduced(name, options, pictures)]
     if not options.quiet:
         sys.stdout.writelines(f"{line}\n" for line in table(findings))
     if page is not None:

@@ -51,8 +51,7 @@ def apart(launch: Callable[[], T], patience: float = _PATIENCE) -> T:
     try:
         _wait(thread, patience)
     except BaseException:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the launcher's, about what is done here
+        with warnings.catch_warnings(action="ignore"):  # of the launcher, about what is done here
             end_children()
             thread.join(_FAREWELL)
         raise

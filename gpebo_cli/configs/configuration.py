@@ -10,7 +10,7 @@ from typing import Any
 from gpebo_cli.configs.locations import LOOK
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.plain_yaml import dump
-from gpebo_cli.schema import convert, read, shown, unknown
+from gpebo_cli.schema import convert, known_name, read, shown
 from gpebo_cli.settings import (
     DataSettings,
     ExcitationSettings,
@@ -43,8 +43,7 @@ def settings(config: Mapping[str, Any], *, draw: bool) -> Settings:
     wrong type, or a value out of range).
     """
     for key in config:
-        if key not in KEYS:
-            raise unknown(f"{key}: no such key", key, KEYS, "the configuration has")
+        known_name(key, KEYS, f"{key}: no such key", "the configuration has")
     data = read(DataSettings, _group(config, "data"), "data")
     built = Settings(
         data=data,

@@ -18,7 +18,7 @@ from gpebo_cli.configs.locations import DATA_GROUPS, GROUPS, PRIMARY, conf_folde
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.plain_yaml import parse
 from gpebo_cli.reading import read_text
-from gpebo_cli.schema import plain, shown, unknown
+from gpebo_cli.schema import known_name, plain, shown
 
 GLOBAL = "_global_"
 """Where the content of a recipe belongs: at the top."""
@@ -120,8 +120,8 @@ def _checked(real: str, path: str, inside: str) -> dict[str, Any]:
 def _recipe(path: str, content: Mapping[str, Any]) -> dict[str, Any]:
     """A recipe or a whole configuration: choices, values of known keys, and a sweep."""
     for key, value in content.items():
-        if key not in (*KEYS, "defaults", "hydra"):
-            raise unknown(f"{path}: {shown(key)}: no such key", key, KEYS, "there are")
+        if key not in ("defaults", "hydra"):
+            known_name(key, KEYS, f"{path}: {shown(key)}: no such key", "there are")
         if key in _SECTIONS and not isinstance(value, dict | None):
             choice = f"; files are chosen as in `- override /{key}: NAME`" if key in GROUPS else ""
             raise ConfigError(

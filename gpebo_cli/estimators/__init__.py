@@ -17,7 +17,7 @@ from gpebo_cli.estimators._base import (
 from gpebo_cli.estimators._information import Information, information
 from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reached
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
-from gpebo_cli.estimators._registry import GROUP, able, build, names, settings_of
+from gpebo_cli.estimators._registry import able, build, names, settings_of
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, mix
 from gpebo_cli.estimators._segments import errors, estimate, goes_on, tuned, tuned_for
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
@@ -46,7 +46,7 @@ from gpebo_cli.regression.samples import SampledRegression
 from gpebo_cli.schema import number, per_name
 
 __all__ = [
-    "GROUP", "Affine", "Array", "ErrorSystem", "ErrorsAt", "Estimates", "Estimator",
+    "Affine", "Array", "ErrorSystem", "ErrorsAt", "Estimates", "Estimator",
     "ExtensionState", "FilteredEstimator", "Fitting", "GainEstimator", "Information",
     "InformationRoot", "KreisselmeierFilter", "LinearRegression", "MixedEstimates", "Moving",
     "Recursion", "Recursive", "Requirement", "Reset", "Resumable", "ResumableEstimates",

@@ -17,7 +17,6 @@ from gpebo_cli.regression.estimator import Estimates, Estimator
 from gpebo_cli.regression.linear import LinearRegression
 
 _ESTIMATORS: Registry[Estimator] = Registry("estimator")
-GROUP = _ESTIMATORS.group
 names, settings_of, able = _ESTIMATORS.names, _ESTIMATORS.settings_of, _ESTIMATORS.able
 
 

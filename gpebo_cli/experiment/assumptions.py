@@ -82,7 +82,7 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
         )
         return Examination(tuple(found))
     signals = simulation.signals
-    derivatives = InputDerivatives.of_plant(system, ~levels.noisy_inputs)
+    derivatives = InputDerivatives.of_plant(system, levels.inputs == 0.0)
     seen = Measurements(signals.inputs, signals.outputs, signal_noise(levels), derivatives)
     return _of_observer(observer, settings, system, seen, found)
 

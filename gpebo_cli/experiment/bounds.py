@@ -26,7 +26,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.mesh import SNAP, Samples, Trajectory
 from gpebo_cli.observers import AffineStateMap, Observation
 from gpebo_cli.regression.estimator import Estimates, Weighing
-from gpebo_cli.schema import check_keys, number, unknown
+from gpebo_cli.schema import check_keys, known_name, number
 
 _TOLERANCE = 1e-10  # of a quantity's size: by less no bound is violated
 _UNMOVED = 1e-12  # share of a state's largest gain, below which no estimate moves it
@@ -118,8 +118,7 @@ def _sides(
 ) -> list[_Side]:
     sides = []
     for name, pair in given.items():
-        if name not in known:
-            raise unknown(f"{where}: there is no {name!r}", name, known, "there are")
+        known_name(name, known, f"{where}: there is no {name!r}", "there are")
         ends = [v if v is None else number(v, f"{where}.{name}", "finite") for v in pair]
         low, high = ends if len(ends) == 2 else (1.0, 0.0)
         if low is not None and high is not None and low > high:

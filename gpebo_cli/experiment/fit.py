@@ -212,6 +212,6 @@ def _explained(
         fed_back=() if observation.errors is None else tuple(compress(
             system.outputs, observation.errors(t[-1:], t[-1:]).B[0][:, system.m :].any(axis=0)
         )),
-        of_inputs=tuple(compress(system.inputs, source.levels.noisy_inputs)),
+        of_inputs=tuple(compress(system.inputs, source.levels.inputs > 0.0)),
         band=1.96 / np.sqrt((~off)[:, seen].sum()),
     )

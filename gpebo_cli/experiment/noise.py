@@ -26,7 +26,7 @@ from math import ceil, factorial, pi
 import numpy as np
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.rows import Rows
@@ -47,11 +47,6 @@ class NoiseLevels:
     outputs: Array  # (r,) σ
     inputs: Array  # (m,) σ
     steps: Array  # (r,) of quantisation
-
-    @property
-    def noisy_inputs(self) -> BoolArray:
-        """Which inputs are measured wrongly, shape (m,)."""
-        return self.inputs > 0
 
     @cached_property
     def silent(self) -> bool:

@@ -70,12 +70,8 @@ def run_experiment(
 
     Progress is called with the name of each stage as it starts, and of a long one again with its
     ``share`` (:class:`Stage`) as it gets on. The ``estimator`` is used instead of the one that the
-    settings name.
-
-    Raises:
-        ConfigError: settings that do not fit the plant.
-        ModelError: the plant cannot be simulated, or Assumption 1 fails.
-        SolverError: a tolerance cannot be reached.
+    settings name (ConfigError: settings that do not fit the plant; ModelError: the plant cannot be
+    simulated, or Assumption 1 fails; SolverError: a tolerance cannot be reached).
     """
     levels = noise_levels(settings.noise, system)
     sources.check(settings, levels)

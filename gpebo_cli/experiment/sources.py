@@ -81,7 +81,7 @@ def simulated(
         noisy = (levels.outputs > 0) | (levels.steps > 0)
         simulated = replace(
             simulated,
-            measured_inputs=np.where(levels.noisy_inputs, measured.inputs(t), simulated.inputs),
+            measured_inputs=np.where(levels.inputs > 0, measured.inputs(t), simulated.inputs),
             measured_outputs=np.where(noisy, measured.outputs(t), simulated.outputs),
         )
     if simulated.impulses and settings.observer["name"] != "none":
@@ -96,7 +96,7 @@ def simulated(
         states=simulation.signals.states, theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated) + functions_note(system, simulated),
-        derivatives=InputDerivatives.of_plant(system, ~levels.noisy_inputs),
+        derivatives=InputDerivatives.of_plant(system, levels.inputs == 0),
         true=simulation.signals, simulation=simulated,
     )
 

@@ -114,9 +114,7 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
 def _loops(branches: Sequence[Element]) -> Iterable[tuple[str, ...]]:
     """One loop of capacitors and sources for every voltage source that is in one."""
     inside = [e for e in branches if e.kind in "CVEH"]
-    for source in inside:
-        if source.kind == "C":
-            continue
+    for source in (e for e in inside if e.kind != "C"):
         path = _path([e for e in inside if e is not source], *source.nodes[:2])
         if path is not None:
             yield (source.name, *path)

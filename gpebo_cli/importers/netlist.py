@@ -41,6 +41,13 @@ _WORD = re.compile(r"[A-Za-z_]\w*")
 _IN_EXPRESSION = re.compile(
     r"(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?\w*)|(?P<word>[A-Za-z_]\w*)"
 )
+_REFUSED = {
+    ".global": "is not read; give each subcircuit a node of its own for it, and hand it on",
+    **dict.fromkeys((".include", ".inc", ".lib"), "would read another file, and a netlist is read "
+                    "alone; put its lines here"),
+    **dict.fromkeys((".model", ".func"), "is not read: elements are linear, "
+                    "R L C K V I E G F H S T X, and expressions stand in braces"),
+}
 
 
 @dataclass(frozen=True)
@@ -298,19 +305,8 @@ class Netlist:
             for quantity in _tokens(rest, place):
                 if quantity.lower() not in ("tran", "all"):
                     self.saved.append(scope.quantity(quantity.lower()))
-        elif head in (".include", ".inc", ".lib"):
-            raise place.error(
-                f"{head} would read another file, and a netlist is read alone; put its lines here"
-            )
-        elif head == ".global":
-            raise place.error(
-                ".global is not read; give each subcircuit a node of its own for it, and hand it on"
-            )
-        elif head in (".model", ".func"):
-            raise place.error(
-                f"{head} is not read: elements are linear, R L C K V I E G F H S T X, and "
-                "expressions stand in braces"
-            )
+        elif head in _REFUSED:
+            raise place.error(f"{head} {_REFUSED[head]}")
         # .param has been read. Others ask for analyses, which gpebo's own settings describe.
 
     def _instance(self, plain: list[str], given: dict[str, str], scope: _Scope) -> None:

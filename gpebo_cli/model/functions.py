@@ -93,21 +93,18 @@ class FunctionCoefficients:
         a function returns the wrong shape, something not finite, or is not analytic where a
         derivative of it is needed; or y is needed and not known).
         """
-        found = {"u": self._values("u", t, order, None)} if signals is None else {}
-        for name in MATRIX_NAMES:
-            depends = self.signals.get(name)
-            along = signals
-            if depends and signals is None:
-                if len(depends) > self.shapes["u"][0]:
-                    raise ConfigError(
-                        f"plant {self.name}: {name} depends on the outputs, which are not known "
-                        "here"
-                    )
-                along = np.concatenate(
-                    [found["u"], np.zeros((order + 1, len(t), self.outputs))], axis=2
+        along, m = signals, self.shapes["u"][0]
+        if self.signals and signals is None:
+            for name in (name for name, depends in self.signals.items() if len(depends) > m):
+                raise ConfigError(
+                    f"plant {self.name}: {name} depends on the outputs, which are not known here"
                 )
-            if name not in found:
-                found[name] = self._values(name, t, order, along if depends else None)
+            nothing = np.zeros((order + 1, len(t), self.outputs))
+            along = np.concatenate([self._values("u", t, order, None), nothing], axis=2)
+        found = {
+            name: self._values(name, t, order, along if name in self.signals else None)
+            for name in MATRIX_NAMES
+        }
         for name, (i, j) in self.places.items():
             values = found[name]
             found[name] = np.zeros((*values.shape[:2], *self.whole[name]))

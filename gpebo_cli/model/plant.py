@@ -55,9 +55,7 @@ def plant_from_mapping(
     file = f" ({source})" if source else ""
     if not isinstance(mapping, Mapping):
         raise ConfigError(f"{kind}{file} must be a mapping with the keys {', '.join(KEYS)}")
-    name = mapping.get("name")
-    if name is None:
-        raise ConfigError(f"{kind}{file}: name is missing")
+    name = _required(mapping, "name", f"{kind}{file}")
     if not isinstance(name, str) or not _PLANT_NAME.fullmatch(name):
         raise ConfigError(
             f"{kind}{file}: name is {brief(name)}; write text of letters, digits, "

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import comb
 from types import MappingProxyType
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -97,8 +96,8 @@ class TextCoefficients:
     signals: Mapping[str, frozenset[str]]  # what a matrix depends on, by the same names
     outputs: frozenset[str]
     name: str
+    divisors: Tape  # continuous ones of outputs, with the text they stand in
     restricted: TextCoefficients | None = None  # ``of_time``, where that is something else
-    divisors: tuple[Expression, ...] = ()  # continuous ones of outputs, with the text they stand in
     cells: Array | None = None  # (number,) edges of cells that are short for another reason
     tables: Mapping[int, Piecewise] = field(default_factory=dict)  # for inputs, by their numbers
     # What others have found out about these matrices, by what was asked: they never change.
@@ -148,7 +147,7 @@ class TextCoefficients:
         if signals is None:
             return Coefficients._make(self.assembly.taylor(t, order, self._amid(inside)))
         found = Coefficients._make(self.assembly.taylor(t, order, inside, signals))
-        if self.divisors:
+        if self.divisors.outputs:
             self._refuse_crossings(t, inside, signals)
         return found.along(signals)
 
@@ -191,14 +190,10 @@ class TextCoefficients:
         followers = self.tape.following(self.tables) & self.tape.of_time
         return self.tape.of([s.argument for s in self.tape.switches if s.argument in followers])
 
-    @cached_property
-    def _divisors(self) -> Tape:
-        return record(self.divisors)
-
     def _refuse_crossings(self, t: Array, inside: Array | None, signals: Array) -> None:
         """Refuse a divisor that changes its sign between two times, or nearly vanishes at one."""
         ascending = np.argsort(t, kind="stable")
-        values = self._divisors.taylor(t, 0, inside, signals[:1])[0][ascending]
+        values = self.divisors.taylor(t, 0, inside, signals[:1])[0][ascending]
         size = np.abs(values)
         before = np.maximum.accumulate(size)
         after = np.maximum.accumulate(size[::-1])[::-1]
@@ -206,7 +201,7 @@ class TextCoefficients:
         crossed = np.argwhere((values[1:] * values[:-1] < 0.0) | (touched & (size[:-1] > 0.0)))
         if len(crossed):
             k, j = crossed[0]
-            where, (before, after) = self.divisors[j], values[k : k + 2, j]
+            where, (before, after) = self.divisors.labels[j], values[k : k + 2, j]
             first, then = t[ascending][k : k + 2]
             at = first
             if before * after < 0.0:
@@ -274,10 +269,6 @@ class TextCoefficients:
                 found = self._with_corners(found, start, stop)
             self._breakpoints[start, stop] = found
         return self._breakpoints[start, stop].copy()
-
-    def blurred(self, cuts: Array) -> Array:
-        """By how much breakpoints (C,) may be wrong beside rounding of the time, in seconds."""
-        return blurred(self.of_time.tape, cuts)
 
     def _with_corners(self, found: Array, start: float, stop: float) -> Array:
         """Breakpoints (number,) of the text with those of tables."""
@@ -365,31 +356,9 @@ class TextCoefficients:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 
 
-@runtime_checkable
-class FollowsSignals(CoefficientSource, Protocol):
-    """A source that knows what its matrices do where signals say so; see TextCoefficients."""
-
-    @property
-    def switches(self) -> Tape:
-        """Arguments of sign, abs, min and max that follow outputs."""
-
-    @property
-    def sided(self) -> tuple[Tape, Tape]:
-        """Arguments of sign, and of all that switches, that follow inputs or outputs."""
-
-    def blurred(self, cuts: Array) -> Array:
-        """By how much breakpoints (C,) may be wrong beside rounding of the time, in seconds."""
-
-    def along(self, signals: Cells, numbers: Container[int], edges: Array) -> tuple[Array, bool]:
-        """``resolved`` for what follows signals of these numbers, from edges (K + 1,)."""
-
-    def with_cells(self, cells: Array) -> CoefficientSource:
-        """The same with ``cells`` (number,) among the edges of what is resolved in time."""
-
-
 def switching(source: CoefficientSource) -> Tape | None:
     """Arguments of what jumps or has a kink where outputs say so, if there are any known."""
-    found = source.switches if isinstance(source, FollowsSignals) else None
+    found = source.switches if isinstance(source, TextCoefficients) else None
     return found if found is not None and found.outputs else None
 
 
@@ -401,8 +370,9 @@ def sided(source: CoefficientSource, order: int = 0) -> Tape | None:
 
 def blur_of(source: CoefficientSource, cuts: Array) -> Array:
     """By how much breakpoints (C,) may be wrong, in units of rounding."""
-    own = source.blurred(cuts) if isinstance(source, FollowsSignals) else 0.0
-    return np.maximum(np.abs(cuts), own / _EPS)
+    if not isinstance(source, TextCoefficients):
+        return np.abs(cuts)
+    return np.maximum(np.abs(cuts), blurred(source.of_time.tape, cuts) / _EPS)
 
 
 def coefficients_of(
@@ -441,8 +411,8 @@ def coefficients_of(
     )
     depending = {key: signals[key] for key in MATRIX_NAMES if signals[key]}
     truth = record(list(entries["theta"][1].values()))
-    divisors = tuple(
+    divisors = record([
         Expression(node, e.text, e.where) for e in varying for node in divisors_of(e.node)
         if not node.signals.isdisjoint(outputs)
-    )
-    return TextCoefficients(assembly, truth, depending, outputs, name, restricted, divisors)
+    ])
+    return TextCoefficients(assembly, truth, depending, outputs, name, divisors, restricted)

@@ -39,7 +39,7 @@ from gpebo_cli.schema import checked
 from gpebo_cli.settings import SolverSettings
 
 __all__ = [
-    "GROUP", "AffineStateMap", "Assumption", "AtSamples", "InitialError", "LinearEquation",
+    "AffineStateMap", "Assumption", "AtSamples", "InitialError", "LinearEquation",
     "LinearProblem", "LinearRegression", "Measurements", "Mesh", "Observation", "Observer",
     "Reached", "Recursion", "Responding", "Sampling", "SignalNoise", "SolverSettings", "StateMap",
     "Trajectory", "Truth", "able", "build", "initial_extension", "names", "observe", "output_scale",
@@ -47,7 +47,6 @@ __all__ = [
 ]
 
 _OBSERVERS: Registry[Observer] = Registry("observer")
-GROUP = _OBSERVERS.group
 names, settings_of, able = _OBSERVERS.names, _OBSERVERS.settings_of, _OBSERVERS.able
 _NONE = "none"  # simulate only
 

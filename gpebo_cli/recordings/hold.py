@@ -23,7 +23,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, Desc
 from gpebo_cli.model.expressions import with_others
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
-from gpebo_cli.schema import unknown
+from gpebo_cli.schema import known_name
 
 # (times (N,), where it is decided which samples they are between (N,)) -> values (N, c)
 Held = Callable[[Array, Array], Array]
@@ -43,9 +43,8 @@ def holds(given: str | Mapping[str, str], system: DescriptorSystem) -> Hold:
         return given
     names = (*system.inputs, *system.outputs)
     for name in given:
-        if name not in names:
-            what = f"data.hold.{printable(name)}: plant {system.name} has no such signal"
-            raise unknown(what, name, names, "those are")
+        what = f"data.hold.{printable(name)}: plant {system.name} has no such signal"
+        known_name(name, names, what, "those are")
     words = tuple(given.get(name, "linear") for name in names)
     return words if len(set(words)) > 1 else words[0]
 

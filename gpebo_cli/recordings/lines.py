@@ -19,7 +19,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.schema import LARGEST, nearest, shown
+from gpebo_cli.schema import LARGEST, known_name, nearest, shown
 from gpebo_cli.settings import DataSettings
 
 TIME = "t"
@@ -97,11 +97,8 @@ def read_header(
     signals = (TIME, *system.inputs, *system.outputs)
     for key, given in (("columns", columns), ("scale", scale)):
         for name in given:
-            if name not in (*signals, *system.states):
-                raise ConfigError(
-                    f"data.{key}: {shown(name)} is no signal of plant {system.name}; those are "
-                    f"{', '.join((*signals, *system.states))}" + nearest(name, signals)
-                )
+            what = f"data.{key}: {shown(name)} is no signal of plant {system.name}"
+            known_name(name, (*signals, *system.states), what, "those are")
     for name, factor in scale.items():
         if not 0.0 < abs(factor) < np.inf:
             raise ConfigError(f"data.scale.{name} must be a finite number other than 0")
@@ -123,14 +120,12 @@ def read_header(
             raise ConfigError(f"{source}, line 1: column {name} stands there {count} times")
         if count == 0:
             unused = [other for other in names if other not in wanted]
-            same = [other for other in unused if other.casefold() == name.casefold()]
-            hint = f"; did you mean {same[0]}?" if same else nearest(name, unused)
             needed = ", ".join(called[signal] for signal in signals)
             kind = "plant" if system.regression is None else "regression"
             raise ConfigError(
                 f"{source}, line 1: there is no column {name}; {kind} {system.name} needs "
-                f"{needed}, the header has {shown(', '.join(names))}{hint}; data.columns says what "
-                "a signal is called"
+                f"{needed}, the header has {shown(', '.join(names))}{nearest(name, unused)}; "
+                "data.columns says what a signal is called"
             )
     factors = {TIME: _SECONDS.get(data.time_unit, 1.0), **scale}
     return Header(

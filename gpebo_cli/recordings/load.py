@@ -9,7 +9,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
-from gpebo_cli.model.text import FollowsSignals
+from gpebo_cli.model.text import TextCoefficients
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, beside_edges
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
@@ -84,7 +84,7 @@ def load(
     both = mesh.along(held(samples.t, values, hold))
     # What is narrow between samples: functions of time, then those of signals.
     edges, bounded = system.coefficients.of_time.resolved(mesh.edges)
-    if isinstance(system.coefficients, FollowsSignals):
+    if isinstance(system.coefficients, TextCoefficients):
         edges, also = system.coefficients.along(both.cells, range(m + system.r), edges)
         bounded = bounded and also
     if len(edges) > len(mesh.edges):

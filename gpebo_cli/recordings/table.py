@@ -249,6 +249,8 @@ def _from_frame(
 ) -> Table:
     """The recording in a data frame."""
     header = read_header(source, [str(name) for name in frame.columns], data, system)
+    if len(frame) < 2:
+        raise ConfigError(f"{source} has {len(frame)} rows; at least 2 are needed")
     columns = []
     for name, k, scale in zip(header.names, header.positions, header.scale, strict=True):
         column, of_time = frame.iloc[:, k], k == header.positions[0]
@@ -275,8 +277,6 @@ def _from_frame(
         wrong |= np.isnan(values)
     if data.missing != "drop":
         wrong[:, 0] |= np.isnan(values[:, 0])
-    if len(values) < 2:
-        raise ConfigError(f"{source} has {len(values)} rows; at least 2 are needed")
     for row, k in np.argwhere(wrong)[:1]:
         raise ConfigError(
             f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is no number "

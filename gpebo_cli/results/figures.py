@@ -25,7 +25,7 @@ from gpebo_cli.results.finished import INITIAL, ErrorCurves, largest, rows_at
 from gpebo_cli.results.names import FIGURE_NAMES, SETTLED
 from gpebo_cli.results.style import Axis, Curve, Panel, check_look, compose, line
 from gpebo_cli.results.symbols import error_of, number_text, symbol, typeset, unit_of
-from gpebo_cli.schema import shown, unknown
+from gpebo_cli.schema import known_name, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,10 +67,8 @@ def regressor(result: RunResult) -> list[Panel]:
                   f"for {typeset(name, labels)}")
             for column, name in enumerate(regression.parameters)
         )
-        name, text = f"ψ, row {row + 1}", rf"$\psi$, row {row + 1}"
-        if len(rows) == 1:
-            name, text = "regressor ψ", r"regressor $\psi$"
-        panels.append(Panel(name, curves, text=text))
+        name = f"ψ, row {row + 1}" if len(rows) > 1 else "regressor ψ"
+        panels.append(Panel(name, curves, text=name.replace("ψ", r"$\psi$")))
     return _with_legend(panels)
 
 
@@ -258,8 +256,7 @@ def overlay(results: Mapping[str, RunResult]) -> list[Panel]:
 def check_names(names: Iterable[str]) -> None:
     """Refuse names that are not figures; worth doing before a long run (ConfigError)."""
     for name in names:
-        if name not in FIGURES:
-            raise unknown(f"figures: there is no figure {shown(name)}", name, FIGURES)
+        known_name(name, FIGURES, f"figures: there is no figure {shown(name)}")
 
 
 def describe(

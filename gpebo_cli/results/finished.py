@@ -234,9 +234,7 @@ def _bytes(path: Path) -> bytes:
     try:
         return read_bytes(path, _MOST_BYTES)
     except ConfigError as error:  # no user wrote this file: a run should have
-        reason = getattr(error.__cause__, "strerror", None)
-        text = f"{path}: {reason}" if reason else str(error).replace(" is not a", ": not a")
-        raise GpeboError(text) from error
+        raise GpeboError(str(error)) from error
 
 
 def read_columns(path: Path, *filled: str, present: Sequence[str] = ()) -> dict[str, Array]:

@@ -88,8 +88,7 @@ def reference_text(panels: Sequence[Panel]) -> str:
 def differences(panels: Sequence[Panel], reference: Path) -> Iterator[str]:
     """Curves of ``panels`` that differ from those in a file that :func:`reference_text` made.
 
-    Yields:
-        One line per curve: which one, where it differs most and by how much.
+    One line per curve: which one, where it differs most and by how much.
     """
     over, *columns = blocks(panels)[0]
     table = read_columns(reference, over.name)

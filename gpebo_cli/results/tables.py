@@ -22,7 +22,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.result import EstimationResult, NoiseStatistics, RunResult
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.results.files import cell, csv_text, write_file, write_text
-from gpebo_cli.schema import unknown
+from gpebo_cli.schema import known_name
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -158,9 +158,7 @@ def frame(result: RunResult, name: str) -> DataFrame:
     ``signals``, ``regression`` and ``excitation`` are indexed by ``t`` in seconds, ``estimates`` by
     ``case`` and ``t``, ``cases`` by ``case``.
     """
-    if name not in TABLES:
-        raise unknown(f"there is no table {name!r}", name, TABLES)
-    table = TABLES[name](result)
+    table = TABLES[known_name(name, TABLES, f"there is no table {name!r}")](result)
     if table is None:
         raise ConfigError(f"this run has no table {name!r}: it was made with observer=none")
     from pandas import DataFrame

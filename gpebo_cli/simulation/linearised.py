@@ -21,7 +21,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
 from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
-from gpebo_cli.model.text import FollowsSignals, sided, switching
+from gpebo_cli.model.text import TextCoefficients, sided, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory, signal_scale
 from gpebo_cli.reduction.strangeness_free import forcing
@@ -102,7 +102,7 @@ class Linearised:
     def sided(self) -> tuple[Tape, Tape] | None:
         """Arguments that follow signals, of what jumps and of what switches: those of the plant."""
         source = self.system.coefficients
-        return source.sided if isinstance(source, FollowsSignals) else None
+        return source.sided if isinstance(source, TextCoefficients) else None
 
     @cached_property
     def _switching(self) -> Tape | None:
@@ -148,7 +148,7 @@ class Linearised:
         hides the rank of rows that cancel.
         """
         source, orders = self.system.coefficients, len(x)
-        if not isinstance(source, FollowsSignals):
+        if not isinstance(source, TextCoefficients):
             return None
         G = np.empty((*x.shape, self.system.r))
         x, u, theta, along = (
@@ -260,6 +260,6 @@ def looked_along(system: DescriptorSystem, known: Trajectory) -> tuple[Array, bo
     ``known`` are inputs and outputs (m + r,); the edges are those of its mesh and more.
     """
     source, mesh = system.coefficients, known.mesh
-    if not isinstance(source, FollowsSignals):
+    if not isinstance(source, TextCoefficients):
         return mesh.edges, True
     return source.along(known.cells, range(system.m, system.m + system.r), mesh.edges)

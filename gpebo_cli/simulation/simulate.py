@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, check_sizes, distinct
-from gpebo_cli.model.text import FollowsSignals, blur_of
+from gpebo_cli.model.text import TextCoefficients, blur_of
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.errors import EPS, NOTHING, TINY, least_sizes, nothing_left
 from gpebo_cli.numerics.linalg import largest_over_time
@@ -78,7 +78,7 @@ def simulate(system: DescriptorSystem, time: TimeSettings, solver: SolverSetting
             last[:] = [_simulate_linear(linear, window, settings, structure)]
         return last[0].signals.states
 
-    plant, source, before = system, cast(FollowsSignals, system.coefficients), None
+    plant, source, before = system, cast(TextCoefficients, system.coefficients), None
     for _ in range(_LOOKS):
         effort = follow(plant, time, replace(solver, name="collocation"), solve_linear)
         found = last[0]

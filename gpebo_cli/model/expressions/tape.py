@@ -316,11 +316,8 @@ class Assembly:
                 self._plans[key] = self._plan(*key)
             plan = self._plans[key]
             if plan is not None:
-                if signals is None:
-                    rows = np.empty((0, len(t)))
-                else:
-                    count = signals.shape[0] * signals.shape[2]
-                    rows = np.swapaxes(signals, 1, 2).reshape(count, len(t))
+                given = np.empty((0, len(t), 0)) if signals is None else signals
+                rows = np.swapaxes(given, 1, 2).reshape(len(given) * given.shape[2], len(t))
                 found = kernels.expressions.jets(t, inside if apart else t, rows, *plan)
         return found or self._placed(self.tape.interpreted(t, order, inside, signals))
 
