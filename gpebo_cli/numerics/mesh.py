@@ -182,15 +182,7 @@ class Sampler:
         """
         found = np.empty((len(factors), values.shape[2]))
         for k, some in self._runs:
-            matrices, weights, own = values[k], self.weights[some], factors[some]
-            there = weights.max(axis=1) == 1.0
-            if there.any():  # at points of the mesh, which follow each other
-                point = weights[there].argmax(axis=1)
-                whole = matrices[point[0] : point[-1] + 1]
-                whole = whole if len(whole) == len(point) else matrices[point]
-                found[some][there] = np.matmul(whole, own[there][..., None])[..., 0]
-            each = matrices @ own[~there].T
-            found[some][~there] = np.einsum("mj,jnm->mn", weights[~there], each)
+            found[some] = np.einsum("mj,jnm->mn", self.weights[some], values[k] @ factors[some].T)
         return found
 
     @cached_property
