@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.arrays import across, axes_of, down, inverses
+from gpebo_cli.kernels.arrays import across, down, inverses
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -138,12 +138,7 @@ def split_in_frame(E: Array, frame: Frame, units: Array, rank_tol: float) -> Spl
     ]
     if not fits(outside, size, B.shape[1], norms[0], norms[1], rank_tol):
         return None
-    pinv = np.zeros((len(E), len(own), len(units)))
-    if (axes := axes_of(U)) is not None:
-        pinv[:, :, axes] = inverse / own[:, None]
-    else:
-        np.matmul(inverse / own[:, None], U.T, out=pinv)
-    return within_frame(frame, pinv)
+    return within_frame(frame, inverse / own[:, None] @ U.T)
 
 
 def fits(
