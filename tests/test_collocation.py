@@ -16,7 +16,6 @@ from gpebo_cli.errors import SolverError
 from gpebo_cli.numerics.collocation import merged, solve, solve_constant
 from gpebo_cli.numerics.errors import CHANCE, EPS, estimated_errors, judged_errors, least_sizes
 from gpebo_cli.numerics.mesh import (
-    Looked,
     Mesh,
     Trajectory,
     equal_lengths,
@@ -565,15 +564,6 @@ def test_a_short_element_that_need_not_be_cut_is_no_reason_to_refuse():
 
     mesh = Mesh(1e9 + np.array([0.0, 0.5, 0.5 + 1e-6]), radau_rule(4))
     assert refine(evaluate, mesh, tol=1e-2, max_elements=9, name="law")[0].size == 5
-
-
-def test_signals_in_units_are_as_well_resolved_as_without():
-    """Three waves, of which the slow one is seen to be resolved in none but its own unit."""
-    rule, units = radau_rule(8), np.array([1e-7, 1.0, 1e5])
-    t = (np.arange(5)[:, None] + rule.points)[..., None]
-    waves = np.sin(np.array([0.1, 2.0, 4.0]) * t)
-    found = Looked.at(waves * units, rule).unresolved(rule, units)
-    np.testing.assert_allclose(found, unresolved(waves, rule), rtol=1e-9)
 
 
 @pytest.mark.parametrize("unit", [2.0**-40, 2.0**40])

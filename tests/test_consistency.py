@@ -30,12 +30,12 @@ from gpebo_cli.reduction.strangeness_free import (
     strangeness_free_form,
 )
 from gpebo_cli.reduction.structure import (
+    Structure,
     _dips,
     _probe_times,
     _refuse_crossing,
     _why_not,
     analyse,
-    without_equations,
 )
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.ivp import consistent_start
@@ -364,7 +364,8 @@ def test_why_a_rank_is_unclear_at_one_time(usual, rounding):
                                                  ((2.0, 2e-12, 0.0), "1.0e-12")])
 def test_a_rank_that_is_another_than_at_the_reference_is_named_with_its_time(singular, value):
     """Of three, two singular values are zero at first: one of them is not, or a third one is."""
-    structure = replace(without_equations(), a=2 if value == "1.0e-03" else 1, rank_tol=1e-10)
+    a = 2 if value == "1.0e-03" else 1
+    structure = Structure(0, a, 0, np.inf, time_invariant=False, rank_tol=1e-10)
     M = np.zeros((4, 3, 3))
     M[:, 0, 0] = 1.0
     M[:, 1, 1] = 1.0 * (structure.a == 1)

@@ -947,7 +947,7 @@ def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, mo
     assert 1.0 < ratio.min() <= ratio.max() < most
 
 
-def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
+def test_units_of_many_states_are_those_of_full_equations(monkeypatch):
     """A ladder in units of all sizes, by sparse factors as by dense ones."""
     rng = np.random.default_rng(3)
     for n in (3, 9, 30):
@@ -959,9 +959,8 @@ def test_units_of_many_states_are_those_that_singular_values_give(monkeypatch):
             "E": rows[:, None] * E * columns, "A": rows[:, None] * A * columns, "C": C * columns,
         }, "units").mapping())
         found = []
-        for kept in (40, 0):
-            scaling._balancing.cache_clear()
-            monkeypatch.setattr(scaling, "_KEPT", kept)
+        for full in (400, 0):
+            monkeypatch.setattr(scaling, "_FULL", full)
             c = system.coefficients.taylor(np.zeros(1), 2)
             found.append(scaling.units_at(c))
         for dense, sparse in zip(*found, strict=True):

@@ -197,8 +197,8 @@ def test_windows_together_have_the_largest_errors_and_sizes_of_each():
         made = mesh.initial_mesh(start, start + 1.0, [], 1, radau_rule(2))
         signals = [np.full((3, *shape), size) for shape in ((1,), (1, 2), (2,), (2, 2))]
         found = Assembled(
-            *signals, size, np.array([size, 2.0]), np.zeros(2, dtype=bool),
-            np.array([[size, 1.0, 3.0 - size]]), np.array([[3.0 - size, 1.0], [0.0, size]]),
+            *signals, size, np.array([size, 2.0]), np.array([[size, 1.0, 3.0 - size]]),
+            np.array([[3.0 - size, 1.0], [0.0, size]]),
         )
         z = Trajectory(made, np.full((1, 3, 1, 3), size))
         return extension.Extension(z, error, found, np.array([[size, 2.0]]), (weakest, start))

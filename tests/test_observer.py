@@ -169,10 +169,10 @@ def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_p
     Y = (4.0 * np.sin(t)[:, None] + np.zeros(2)) * offset
     found = Assembled(
         Y, psi / of_parameters, x * of_states, gain * unit, 4.0 * offset, columns / of_parameters,
-        np.zeros(5, dtype=bool), np.ones((5, 4)), moving * unit,
+        np.ones((5, 4)), moving * unit,
     )
     by = rounding * of_states[:, None] / of_states
-    rows, regressor, states, gains, squares, products = found.kinds(of_states, None, by)
+    rows, regressor, states, gains, squares, products = found.kinds(of_states, by)
     each = np.array([1.0, 5.0, 1.0])
     largest = (np.abs(gain).max(axis=0) / each).max(axis=1)
     sizes = np.array([largest[0], 1e-3 * (10.0 if offset else 1.0), 0.05, 5.0, 1.0])

@@ -364,9 +364,9 @@ def test_window_gramians_are_resolved_in_any_units_of_the_outputs():
         return np.zeros((1, 1, 1)), small * (1.0 + np.cos(20.0 * t))[:, None, None]
 
     mesh = initial_mesh(0.0, 20.0, [], 40, radau_rule(5))
-    found = window_gramians(model, 1, mesh, tol=1e-8, max_elements=5000)
-    whole = np.isin(found.starts, mesh.edges)  # there, windows end at edges
-    t, M = found.starts[whole], found.gramians[whole, 0, 0]
+    gramians, starts, _ = window_gramians(model, 1, mesh, tol=1e-8, max_elements=5000)
+    whole = np.isin(starts, mesh.edges)  # there, windows end at edges
+    t, M = starts[whole], gramians[whole, 0, 0]
     expected = window + (np.sin(20.0 * (t + window)) - np.sin(20.0 * t)) / 20.0
     np.testing.assert_allclose(M / small, expected, rtol=1e-8)
 
@@ -381,14 +381,12 @@ def test_window_gramians_of_a_constant_system(stages):
     def model(t: Array, inside: Array) -> tuple[Array, Array]:
         return np.broadcast_to(A, (len(t), 2, 2)), np.broadcast_to(W, (len(t), 2, 2))
 
-    found = window_gramians(model, 2, mesh, tol=1e-11, max_elements=1000)
-    big = expm(np.block([[-A.T, W], [np.zeros((2, 2)), A]]) * found.window)
+    gramians, starts, window = window_gramians(model, 2, mesh, tol=1e-11, max_elements=1000)
+    big = expm(np.block([[-A.T, W], [np.zeros((2, 2)), A]]) * window)
     expected = big[2:, 2:].T @ big[:2, 2:]
-    assert found.window == pytest.approx(2.0)
-    assert found.starts[[0, -1]] == pytest.approx([1.0, 19.0])
-    np.testing.assert_allclose(
-        found.gramians, np.broadcast_to(expected, found.gramians.shape), rtol=1e-9
-    )
+    assert window == pytest.approx(2.0)
+    assert starts[[0, -1]] == pytest.approx([1.0, 19.0])
+    np.testing.assert_allclose(gramians, np.broadcast_to(expected, gramians.shape), rtol=1e-9)
 
 
 @pytest.mark.parametrize("origin", [0.0, 1e6])
@@ -403,11 +401,11 @@ def test_window_gramians_do_not_hang_on_the_mesh(origin):
     for edges in (np.linspace(0.0, 10.0, 8), np.array([0.0, 0.3, *np.geomspace(0.7, 10.0, 60)])):
         mesh = Mesh(edges, radau_rule(8), origin)
         found.append(window_gramians(model, 2, mesh, tol=1e-12, max_elements=2000))
-    one, other = found
-    np.testing.assert_allclose(one.starts - origin, other.starts - origin, atol=1e-8)
-    assert one.starts[[0, -1]] - origin == pytest.approx([0.0, 9.0])
-    size = np.abs(one.gramians).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(one.gramians / size, other.gramians / size, atol=1e-8)
+    (one, starts, _), (other, other_starts, _) = found
+    np.testing.assert_allclose(starts - origin, other_starts - origin, atol=1e-8)
+    assert starts[[0, -1]] - origin == pytest.approx([0.0, 9.0])
+    size = np.abs(one).max(axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(one / size, other / size, atol=1e-8)
 
 
 def test_a_chain_of_many_states_needs_few_elements():

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import get_type_hints
 
 import numpy as np
 
-from gpebo_cli.estimators._base import GainEstimator, axis, combinations
+from gpebo_cli.estimators._base import axis, combinations
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
 from gpebo_cli.registry import Registry
@@ -52,12 +52,6 @@ class Several:
         """The cases of the first one, then of the second one, and so on."""
         pairs = zip(self.chosen, self.members, strict=True)
         return tuple({**own, **case} for own, member in pairs for case in member.cases)
-
-    def tuned(self, requirement: Callable[[Estimator], Requirement]) -> Several:
-        """All with numbers for gains that are ``auto``, by the ``requirement`` for γ = 1."""
-        return Several(self.chosen, tuple(
-            m.tuned(requirement) if isinstance(m, GainEstimator) else m for m in self.members
-        ))
 
     def estimate(self, regression: LinearRegression, t: Array) -> Estimates:
         """Prepare the estimates of all at the times t (M,)."""

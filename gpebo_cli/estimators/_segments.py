@@ -48,9 +48,10 @@ def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
 
 def tuned_for(estimator: Estimator, requirement: Callable[[Estimator], Requirement]) -> Estimator:
     """:func:`tuned`, by what data make an estimator require."""
-    if isinstance(estimator, GainEstimator | Several):
-        return estimator.tuned(requirement)
-    return estimator
+    if isinstance(estimator, Several):
+        members = tuple(tuned_for(member, requirement) for member in estimator.members)
+        return replace(estimator, members=members)
+    return estimator.tuned(requirement) if isinstance(estimator, GainEstimator) else estimator
 
 
 def goes_on(estimator: Estimator) -> bool:

@@ -47,31 +47,6 @@ def lagged(regression: LinearRegression, delay: float, t: Array, inside: Array) 
     return np.swapaxes(np.concatenate([regression.psi(t, inside), before], axis=-1), -1, -2)
 
 
-def averaged(
-    regression: LinearRegression, delay: float, settle: float, before: Array | float
-) -> Trajectory:
-    """Means of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
-
-    What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
-    vanishes as the mean is taken over longer and longer times. The mesh has edges where the delayed
-    ψ has; d and T₀ are in seconds. Of a window t counts from the start of the first one, and Z from
-    what it was ``before``.
-    """
-    edges, every = regression.mesh.edges, (regression.whole or regression).mesh.edges
-    later = every[slice(*np.searchsorted(every + delay, edges[[0, -1]]))] + delay
-    after = np.searchsorted(edges, later)
-    apart = np.minimum(edges[after] - later, later - edges[after - 1])
-    cuts = np.union1d(edges, later[apart > 1e-12 * (every[-1] - every[0])])
-    mesh = Mesh(cuts, regression.mesh.rule)
-    t, inside = mesh.points.ravel(), mesh.inside.ravel()
-    psi, Y = regression.psi(t, inside), regression.Y(t, inside)
-    both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
-    product = lagged(regression, delay, t, inside) @ both
-    sums = mesh.trajectory(product).integral().values
-    span = (settle + mesh.points - every[0])[..., None, None]
-    return Trajectory(mesh, (sums + before * span[0, 0]) / span)
-
-
 @dataclass(frozen=True, kw_only=True)
 class Instrumental(WindowedEstimator):
     """Means of products with a delayed ψ, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
@@ -87,9 +62,28 @@ class Instrumental(WindowedEstimator):
     settle: float = field(default=1.0, metadata={"positive": True})
 
     def means(self, regression: LinearRegression, known: Known) -> Trajectory:
-        """Means of products with [ψ(t) ; ψ(t − d)]ᵀ, (2p, p + c)."""
+        """Of [ψ(t) ; ψ(t − d)]ᵀ [ψ | Y], shape (2p, p + c): Z' = (product − Z)/(T₀ + t), Z = 0.
+
+        What a disturbance of Y has in common with a factor stays in the mean of that row; the rest
+        vanishes as the mean is taken over longer and longer times. The mesh has edges where the
+        delayed ψ has. Of a window t counts from the start of the first one, and Z from what is
+        ``known``.
+        """
+        edges, every = regression.mesh.edges, (regression.whole or regression).mesh.edges
+        later = every + self.delay
+        later = later[slice(*np.searchsorted(later, edges[[0, -1]]))]
+        after = np.searchsorted(edges, later)
+        apart = np.minimum(edges[after] - later, later - edges[after - 1])
+        cuts = np.union1d(edges, later[apart > 1e-12 * (every[-1] - every[0])])
+        mesh = Mesh(cuts, regression.mesh.rule)
+        t, inside = mesh.points.ravel(), mesh.inside.ravel()
+        psi, Y = regression.psi(t, inside), regression.Y(t, inside)
+        both = np.concatenate([psi, with_realisations(psi, Y)], axis=-1)
+        product = lagged(regression, self.delay, t, inside) @ both
+        sums = mesh.trajectory(product).integral().values
+        span = (self.settle + mesh.points - every[0])[..., None, None]
         before = known[0].values if known else 0.0
-        return averaged(regression, self.delay, self.settle, before)
+        return Trajectory(mesh, (sums + before * span[0, 0]) / span)
 
     def recursive(self, parameters: Sequence[str]) -> RecursiveMixed:
         """The estimator at samples."""

@@ -19,6 +19,7 @@ from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.numerics.rows import Rows, of_lines
 
 _DEGREE = 3
+_EXACT = 1e4  # times an error of 1: what is known counts as one of 1 in so many
 _NONE, _NOWHERE = np.zeros(0), np.zeros(0, dtype=np.intp)
 
 
@@ -121,20 +122,19 @@ def _of_splines(pieces: list[Array]) -> Groups:
         count = max(len(x), ends)
         first = np.arange(count - _DEGREE)
         knots = np.concatenate([x[:1].repeat(ends), x[2:-2], x[-1:].repeat(ends)])
-        if len(x) < ends:
-            shares, memory = _of_few(x, knots)
-        else:
-            # The first two intervals between rows are of one polynomial, and so are the last two.
-            row = (np.arange(count) - 1).clip(0, count - ends)
-            T = _splines(knots, row + _DEGREE, x)
-            bands = np.zeros((ends, count))  # of TᵀT, from its last row and column to the first
-            for j in range(ends):
-                for i in range(ends - j):
-                    bands[j] += np.bincount(row + i, T[i] * T[i + j], count)
-                bands[j, : count - j] = bands[j, : count - j][::-1]
-                bands[j, count - j :] = 0.0
-            L = cholesky_banded(bands, lower=True)[:, ::-1]
-            shares, memory = 1.0 / L[0], -(L[1:] / L[0]).T
+        # The first two intervals between rows are of one polynomial, and so are the last two.
+        row = (np.arange(count) - 1).clip(0, count - ends)
+        # That through two or three rows has no differences of a higher order.
+        none = np.diff(np.eye(ends), min(len(x), ends))
+        T = np.hstack([_splines(knots, row[: len(x)] + _DEGREE, x), _EXACT * none])
+        bands = np.zeros((ends, count))  # of TᵀT, from its last row and column to the first
+        for j in range(ends):
+            for i in range(ends - j):
+                bands[j] += np.bincount(row + i, T[i] * T[i + j], count)
+            bands[j, : count - j] = bands[j, : count - j][::-1]
+            bands[j, count - j :] = 0.0
+        L = cholesky_banded(bands, lower=True)[:, ::-1]
+        shares, memory = 1.0 / L[0], -(L[1:] / L[0]).T
         found.append((
             x[np.append(0, first[1:] + 1)], shares, memory, first + errors, knots,
             first + _DEGREE + places,
@@ -142,21 +142,6 @@ def _of_splines(pieces: list[Array]) -> Groups:
         errors, places = errors + count, places + len(knots)
     starts, shares, memory, first, knots, knot = map(np.concatenate, zip(*found, strict=True))
     return Groups(starts, starts, shares, memory, first, starts[:0], knots, knot)
-
-
-def _of_few(x: Array, knots: Array) -> tuple[Array, Array]:
-    """Shares (4,) and memory (4, 3) of the polynomial through two or three rows (N,)."""
-    from scipy.interpolate import CubicSpline  # slow to import
-
-    ends = _DEGREE + 1
-    t = np.linspace(x[0], x[-1], ends)
-    values, basis = CubicSpline(x, np.eye(len(x)))(t), _splines(knots, np.full(ends, _DEGREE), t)
-    R = np.asarray(np.linalg.qr(np.linalg.solve(basis.T, values).T, mode="r"))  # c = Rᵀw
-    shares, memory = np.append(np.diagonal(R), np.zeros(ends - len(x))), np.zeros((ends, _DEGREE))
-    for k in range(ends):
-        own = slice(min(k, len(x)))
-        memory[k, k - 1 - np.arange(own.stop)] = np.linalg.solve(R[own, own], R[own, k])
-    return shares, memory
 
 
 def _splines(knots: Array, knot: IntArray, t: Array) -> Array:

@@ -136,7 +136,7 @@ class _Chain:
             part, joint = self.looked(part, t[chosen])
             if self.rate * (mesh.edges[-1] - mesh.edges[0]) > _FASTEST:
                 return np.full(found.shape, np.nan)
-            part, maps, factors, (common, varies) = self.along(part, joint, t[chosen])
+            part, maps, factors = self.along(part, joint, t[chosen])
             if not len(chosen):
                 continue
             zeta, size = self.zeta, maps.shape[2]
@@ -152,10 +152,7 @@ class _Chain:
             for k, each in enumerate(now):
                 here[:, size + own, size + k * len(own) + own] = each[:, None]
             inside = part.inside[element, 1]
-            C = common[None].repeat(len(chosen), axis=0)
-            if len(others := varies[element].nonzero()[0]):
-                C[others] = self._estimator(t[chosen][others], inside[others]).C
-            o = self.observer(t[chosen], inside)
+            o, C = self.observer(t[chosen], inside), self._estimator(t[chosen], inside).C
             rows = o.C.shape[1] - n  # of Y; those of the offset stand below
             out = np.zeros((len(chosen), p + n, here.shape[1]))  # [η; x] of them
             out[:, :p, zeta:size], out[:, p:, zeta:size] = C, gain[chosen] @ C
@@ -182,11 +179,10 @@ class _Chain:
 
     def along(
         self, mesh: Mesh, joint: ErrorSystem, t: Array
-    ) -> tuple[Mesh, Array, Array, tuple[Array, BoolArray]]:
+    ) -> tuple[Mesh, Array, Array]:
         """These elements, cut until all is resolved that decides what is at times t (M,).
 
-        And what they make of L at their left ends for [ζ; s] at the nodes, these L, and C at the
-        end, with the elements in which it is another one.
+        And what they make of L at their left ends for [ζ; s] at the nodes, and these L.
         """
         new, cuts = np.ones(mesh.size, dtype=bool), 0
         while True:
@@ -194,12 +190,9 @@ class _Chain:
             weights = self._groups.weights(mesh.points[new, 1:], group[new, None], self._until)
             B = np.concatenate([each[..., None, None] * joint.B for each in weights], axis=3)
             made = error_maps(mesh, mesh.steps[new], joint.A, B)
-            (count, stages), C = made.shape[:2], joint.C
-            C = C if len(C) > 1 else C.repeat(count * stages, axis=0)
             if not cuts:
-                maps, common, varies = made, C[-1], np.empty(mesh.size, dtype=bool)
+                maps = made
             maps[new] = made
-            varies[new] = (common != C).any(axis=(1, 2)).reshape(count, stages).any(axis=1)
             left = mesh.edges[:-1]
             factors, end = _factors(
                 maps[:, -1], np.diff(group, prepend=self._group) > 0, np.isin(left, self._anew),
@@ -215,9 +208,9 @@ class _Chain:
                 poor &= tail > _TOLERANCE * 10.0**cuts
             if not poor.any():
                 self._L, self._group = end, int(group[-1])
-                return mesh, maps, factors, (common, varies)
+                return mesh, maps, factors
             mesh, kept = mesh.split(wanted_parts(tail, poor, _TOLERANCE, mesh.rule.stages))
-            maps, varies, new, cuts = maps[kept], varies[kept], kept < 0, cuts + 1
+            maps, new, cuts = maps[kept], kept < 0, cuts + 1
             joint = self._joint(self.observer, mesh, new)[0]
 
     def _joint(

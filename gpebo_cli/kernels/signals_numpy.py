@@ -26,26 +26,16 @@ def tails(
     if not values.size:
         return np.zeros(len(values))
     last = np.abs(np.matmul(to_legendre[len(to_legendre) - used :], values))
-    return tails_of(np.abs(values).max(axis=1), last, len(to_legendre), foot, share, floor, least)
-
-
-def tails_of(
-    sizes: Array, last: Array, points: int, foot: float, share: float, floor: float,
-    least: Array | None, units: Array | float = 1.0,
-) -> Array:
-    """:func:`tails` of signals by their largest sizes (K, c) and last coefficients (K, used, c).
-
-    The sizes are in ``units``; ``least`` is for signals without them.
-    """
-    used, size = last.shape[1], np.maximum.accumulate(sizes, axis=0)
+    size = np.maximum.accumulate(np.abs(values).max(axis=1), axis=0)
     final = size[-1]
     size = np.maximum(size, foot * final)
-    unit = units * np.ones_like(final)
+    unit = np.ones_like(final)
     if least is not None:
         unit = np.maximum(np.maximum(final, least), _TINY)
         size = np.where(final < unit, 1.0, size / unit)
     size = np.maximum(size, np.maximum(share * size.max(axis=1, keepdims=True), max(floor, _TINY)))
     worst = (last / (size * unit)[:, None]).max(axis=2)
+    points = len(to_legendre)
     powers = points / np.arange(points - used, points)
     return np.asarray((np.minimum(worst, 1.0) ** powers).max(axis=1, initial=0.0))
 

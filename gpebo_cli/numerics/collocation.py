@@ -39,7 +39,6 @@ from gpebo_cli.numerics.errors import (
 )
 from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.mesh import (
-    Looked,
     Mesh,
     Trajectory,
     equal_lengths,
@@ -195,7 +194,7 @@ def _tail_of_numbers(
 
 def unresolved_signals(
     problem: LinearProblem, rule: RadauRule, values: Array, extras: tuple[Array, ...],
-    made_of: Array, tol: float, looked: Looked | None = None,
+    made_of: Array, tol: float,
 ) -> Array:
     """:func:`unresolved_kinds` over the solution and everything computed from it, shape (K,).
 
@@ -205,7 +204,7 @@ def unresolved_signals(
     size, points, n, columns = values.shape
     tail = np.zeros(size)
     if problem.monitor is not None:  # it may show elements before these
-        tail = unresolved_kinds(problem.monitor(values, extras), rule, looked)[-size:]
+        tail = unresolved_kinds(problem.monitor(values, extras), rule)[-size:]
     if problem.told:
         return tail
     least = least_sizes(problem, made_of, tol).reshape(n * columns)

@@ -7,15 +7,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, reduce
 from itertools import pairwise
 from math import factorial, prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from gpebo_cli.kernels import elements, signals, signals_numpy
+from gpebo_cli.kernels import elements, signals
 from gpebo_cli.model.descriptor import Array, IntArray
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
-from gpebo_cli.numerics.linalg import largest_over_time, largest_within
+from gpebo_cli.numerics.linalg import largest_over_time
 from gpebo_cli.numerics.radau import RadauRule
 
 # Functions that jump are decided this far (relative to the element) inside its ends, so that both
@@ -37,29 +37,7 @@ _WINDOW = 1 << 12  # elements of a long mesh that are solved together
 
 
 # Point values (K, s + 1, c) of signals of one kind, and what is small among them: ``unresolved``.
-# Or None for the solution itself, measured in units (c,).
-Kind = tuple[Any, float | Array]
-
-
-class Looked(NamedTuple):
-    """What is seen of point values (K, s + 1, c) of signals, looking at them once."""
-
-    sizes: Array  # (K, c) the largest in each element
-    last: Array  # (K, up to 4, c) sizes of the last Legendre coefficients
-
-    @classmethod
-    def at(cls, values: Array, rule: RadauRule) -> Looked:
-        """At values (K, s + 1, …)."""
-        flat = _flat(values)
-        last = np.matmul(rule.to_legendre[-4:], flat)
-        return cls(largest_within(flat), np.abs(last, out=last))
-
-    def unresolved(self, rule: RadauRule, units: Array | float) -> Array:
-        """As :func:`unresolved` of these signals in units (c,), without a floor."""
-        return signals_numpy.tails_of(
-            self.sizes / units, self.last[:, -len(rule.to_next) :], len(rule.points), _FOOT, SHARE,
-            0.0, None, units,
-        )
+Kind = tuple[Array, float | Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,15 +182,7 @@ class Sampler:
         """
         found = np.empty((len(factors), values.shape[2]))
         for k, some in self._runs:
-            matrices, weights, own = values[k], self.weights[some], factors[some]
-            there = weights.max(axis=1) == 1.0
-            if there.any():  # at points of the mesh, which follow each other
-                point = weights[there].argmax(axis=1)
-                whole = matrices[point[0] : point[-1] + 1]
-                whole = whole if len(whole) == len(point) else matrices[point]
-                found[some][there] = np.matmul(whole, own[there][..., None])[..., 0]
-            each = matrices @ own[~there].T
-            found[some][~there] = np.einsum("mj,jnm->mn", weights[~there], each)
+            found[some] = np.einsum("mj,jnm->mn", self.weights[some], values[k] @ factors[some].T)
         return found
 
     @cached_property
@@ -369,15 +339,9 @@ def unresolved(values: Array, rule: RadauRule, floor: float | Array = 0.0) -> Ar
     )
 
 
-def unresolved_kinds(
-    kinds: Iterable[Kind], rule: RadauRule, solution: Looked | None = None
-) -> Array:
+def unresolved_kinds(kinds: Iterable[Kind], rule: RadauRule) -> Array:
     """:func:`unresolved` of signals of several kinds (values, floor), the worst; shape (K,)."""
-    return np.asarray(reduce(np.maximum, (
-        unresolved(values, rule, floor) if values is not None
-        else solution.unresolved(rule, floor)  # type: ignore[union-attr]
-        for values, floor in kinds
-    )))
+    return reduce(np.maximum, (unresolved(values, rule, floor) for values, floor in kinds))
 
 
 def legendre_tail(values: Array, rule: RadauRule, scale: Array) -> Array:

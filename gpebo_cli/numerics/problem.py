@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.mesh import Kind, Mesh
 
 
 class Constraints(NamedTuple):
@@ -48,7 +48,7 @@ class LinearEquation(NamedTuple):
 
 
 # (point values (K, s + 1, n, columns), extras (K, s + 1, ...)) -> signals by kind
-Monitor = Callable[[Array, tuple[Array, ...]], Iterable[tuple[Any, float | Array]]]
+Monitor = Callable[[Array, tuple[Array, ...]], Iterable[Kind]]
 
 
 @dataclass(frozen=True)

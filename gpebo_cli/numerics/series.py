@@ -21,7 +21,8 @@ from gpebo_cli.numerics import taylor
 from gpebo_cli.numerics.collocation import LinearSolution, decoupled, unresolved_signals
 from gpebo_cli.numerics.elimination import StiffError, by_elimination
 from gpebo_cli.numerics.errors import END, EPS, LEVEL, TINY, Errors, judged_errors, random_signs
-from gpebo_cli.numerics.mesh import SHARE, Looked, Mesh, Trajectory, equal_lengths, predicted_tail
+from gpebo_cli.numerics.linalg import largest_within
+from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, equal_lengths, predicted_tail
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray
 from gpebo_cli.numerics.refinement import refine
@@ -79,14 +80,11 @@ def solve(
             values, change = map(np.concatenate, zip(done, (values, change), strict=True))
         if (change[np.isfinite(change)] > 8.0 * enough).any() or not np.isfinite(values[-1]).all():
             raise StiffError
-        looked = Looked.at(values, mesh.rule)
-        sizes = looked.sizes.reshape(mesh.size, *values.shape[2:])
+        sizes = largest_within(values)
         made_of, moved = _terms(A, f, mesh, values, sizes)
         made_of = sizes if stiff else made_of
-        found = _Found(A, Trajectory(mesh, values), looked, sizes, change, made_of, moved, extras)
-        tail = unresolved_signals(
-            problem, mesh.rule, values, extras, made_of.max(axis=0), tol, looked
-        )
+        found = _Found(A, Trajectory(mesh, values), sizes, change, made_of, moved, extras)
+        tail = unresolved_signals(problem, mesh.rule, values, extras, made_of.max(axis=0), tol)
         return found, np.maximum(tail, np.isinf(change))  # zeros where no series converges
 
     try:
@@ -138,7 +136,6 @@ class _Found(NamedTuple):
 
     A: Sparse
     trajectory: Trajectory  # (d, c)
-    looked: Looked
     sizes: Array  # (K, d, c) the largest in each element
     change: Array  # (K,) the last in each element, relative
     made_of: Array  # (K, d, c) sizes of what right ends are the sum of
@@ -212,7 +209,8 @@ def _errors(
     A, values, rule = found.A, found.trajectory.values, mesh.rule
     K, points, n, columns = values.shape
     sizes = found.sizes
-    size, last = np.maximum(sizes, TINY), found.looked.last
+    last = np.abs(rule.to_legendre[-4:] @ values.reshape(K, points, n * columns))
+    size = np.maximum(sizes, TINY)
     tail = predicted_tail(last, rule, size.reshape(K, -1)).reshape(sizes.shape)
     # As in numerics.errors; and what series leave out.
     units = np.ones((n, 1)) if problem.units is None else problem.units

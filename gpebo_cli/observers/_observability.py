@@ -11,7 +11,7 @@ with Ψ = I, so that nothing grows over the horizon.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -28,23 +28,14 @@ _SAME = 1e-9  # of a window: times that are no different
 _STAGES = 6  # at least: products that begin anew in every element look rough to fewer
 
 
-@dataclass(frozen=True, eq=False)
-class WindowGramians:
-    """M over windows of ``window`` seconds."""
-
-    starts: Array  # (W,)
-    gramians: Array  # (W, n, n)
-    window: float
-
-
 def window_gramians(
     model: Callable[[Array, Array], tuple[Array, Array]], n: int, mesh: Mesh, *, tol: float,
     max_elements: int,
-) -> WindowGramians:
-    """M over windows of a tenth of the horizon, which begin at times of equal distance.
+) -> tuple[Array, Array, float]:
+    """M (W, n, n) over windows of a tenth of the horizon, when these begin (W,), and its length.
 
-    ``model`` gives A and W (N, n, n) at times (N,); ``tol`` is relative to the size of Ψ and of
-    what is integrated.
+    They begin at times of equal distance. ``model`` gives A and W (N, n, n) at times (N,); ``tol``
+    is relative to the size of Ψ and of what is integrated.
     """
 
     def coefficients(t: Array, inside: Array) -> LinearEquation:
@@ -81,9 +72,8 @@ def window_gramians(
     starts, transition, local = map(np.concatenate, zip(*found, strict=True))
     first = np.searchsorted(starts, grid[:-_STARTS])
     after = np.searchsorted(np.append(starts, stop), grid[_STARTS:])
-    return WindowGramians(
-        mesh.origin + grid[:-_STARTS], _summed(transition, local, first, after)[1], float(window)
-    )
+    gramians = _summed(transition, local, first, after)[1]
+    return gramians, mesh.origin + grid[:-_STARTS], float(window)
 
 
 def _summed(

@@ -34,7 +34,7 @@ from gpebo_cli.observers._filter_model import (
     filter_model,
     inside_range,
 )
-from gpebo_cli.observers._observability import WindowGramians, window_gramians
+from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import Filtered, StateSpace, filter_windows, pair
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.observers.reduced.condensed import beyond, thinned
@@ -120,7 +120,7 @@ class KalmanBucy:
             followed.information, len(start), filtered.mesh, tol=max(solver.tol, 1e-9),
             max_elements=solver.max_elements,
         )
-        observability = _uniform_observability(gramians, P0, known, sizes)
+        observability = _uniform_observability(*gramians, P0, known, sizes)
         note = evidence.note + _told(level, known.form.noise_enters(noise.variances > 0.0))
         intensities = (f"intensity_{name}" for name in (*system.inputs, *system.outputs))
         used: dict[str, float | int | str | None] = dict(
@@ -314,23 +314,23 @@ def _initial_covariance(variances: Array, known: ReducedSystem) -> Array:
 
 
 def _uniform_observability(
-    windows: WindowGramians, P0: Array, known: ReducedSystem, sizes: Array
+    gramians: Array, starts: Array, window: float, P0: Array, known: ReducedSystem, sizes: Array
 ) -> Requirement:
     """λ_min of M, of ζ in units of ``sizes`` (n,), over all windows, in units of P(0)⁻¹.
 
-    It is that in the directions that ζ has.
+    It is that in the directions that ζ has; the first three are those of :func:`window_gramians`.
     """
     n, q = len(P0), known.system.q
-    split = known.matrices(windows.starts, windows.starts).split
+    split = known.matrices(starts, starts).split
     inside = inside_range(q, split) * sizes / sizes[:, None]
     scale = np.sqrt(np.diag(P0)) / sizes
     scale = np.where(scale > 0, scale, scale.max(initial=0.0) or 1.0)
-    M = scale[:, None] * (inside @ windows.gramians @ inside) * scale
+    M = scale[:, None] * (inside @ gramians @ inside) * scale
     values = np.linalg.eigvalsh(M)
     rank = q + len(known.begin.names)
     smallest = np.maximum(values[:, n - rank], 0.0)
     k = int(np.argmax(smallest <= smallest.min() * _ALIKE))  # the first of those that are alike
-    level, at, window = float(smallest[k]), float(windows.starts[k]), windows.window
+    level, at = float(smallest[k]), float(starts[k])
     needed = _LEVEL * float(values.max(initial=0.0))
     return Requirement(
         name="uniform observability",

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gpebo_cli.model.descriptor import (
     Array,
@@ -20,12 +17,9 @@ from gpebo_cli.model.descriptor import (
 )
 from gpebo_cli.numerics.linalg import largest_over_time
 
-_KEPT = 64  # states, up to which what the pattern of E and A alone decides is kept
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
 _SCALED = 16  # rounds in which rows and columns are brought to the size one
-_SINGULAR = 1e-12  # of the largest: singular values of what terms leave open
-_SOLVED = 1 << 13  # factors times terms, up to which products with what solves for them pay
 _OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
 _DECADES = 24.0  # of the unit of an unknown, at most: what rises later may be next to nothing yet
@@ -71,20 +65,17 @@ def balance(c: Coefficients, mass: float = 1.0) -> Scaling:
     state or the time by a number changes its factor alone. Terms of E count ``mass`` times.
     """
     sizes = np.array([largest_over_time(distinct(matrix)[0]) for matrix in (c.E, c.A)])
-    return _scaling(_factors(sizes, np.zeros(sizes.shape, dtype=np.int8), mass)[0])
+    places = sizes.nonzero()
+    return balance_entries(sizes[places], places, len(sizes[0]), mass)
 
 
-def balance_entries(sizes: Array, places: tuple[IntArray, IntArray, IntArray], n: int) -> Scaling:
+def balance_entries(
+    sizes: Array, places: tuple[IntArray, ...], n: int, mass: float = 1.0
+) -> Scaling:
     """:func:`balance` of n equations by entries of these sizes (e,): 0 of E or 1 of A, i and j."""
-    some = sizes > 0.0
-    while True:
-        (kind, i, j), logs = (place[some] for place in places), np.log(sizes[some])
-        terms = _Terms.at(i, j, kind - 1, (n, n))
-        factors = terms.nearest(np.ones(len(logs)), logs)
-        rest = terms.counting(factors, logs)
-        if rest.all():
-            return _scaling(factors)
-        some[some] = rest
+    kind, i, j = places
+    counts = np.where(kind == 0, mass, 1.0)
+    return _scaling(_factors(sizes, i, j, kind - 1, (n, n), counts)[0])
 
 
 def _scaling(factors: Array) -> Scaling:
@@ -107,14 +98,19 @@ def units_at(c: Coefficients) -> Units:
         np.abs(matrix[:, 0]) for matrix in (c.E, c.A, c.F)
     )
     entries[:, 1, n:, :n], entries[:, 1, n:, n:] = np.abs(c.C[:, 0]), np.abs(c.H[:, 0])
-    order = (entries > 0.0).argmax(axis=0).astype(np.int8)
+    order = (entries > 0.0).argmax(axis=0)
     sizes = np.choose(order, entries)
-    factors, there, terms, logs = _factors(sizes, order, 1.0)
+    kind, i, j = sizes.nonzero()
+    order, sizes = (x[kind, i, j] for x in (order, sizes))
+    factors, there, terms, logs = _factors(
+        sizes, i, j, kind + order - 1, (n + r, n + q), np.ones(len(sizes))
+    )
     for _ in range(_ROUNDS):
         counts = np.minimum(np.maximum(np.exp(2.0 * (terms @ factors + logs)), _LITTLE), 1.0)
         factors = terms.nearest(counts, logs)
     factors /= np.log(10.0)
-    linked = there[0] | there[1]
+    linked = np.zeros((n + r, n + q), dtype=bool)
+    linked[i[there], j[there]] = True
     outputs_first = np.array([*range(n, n + r), *range(n)], dtype=np.intp)
     first, one = _first_of_each_part(linked, outputs_first), linked.argmax(axis=0)
     start = _references(factors[: n + r], first, (first >= n) == (np.arange(n + r) >= n))
@@ -126,19 +122,19 @@ def units_at(c: Coefficients) -> Units:
 
 
 def _factors(
-    sizes: Array, order: NDArray[np.int8], mass: float
+    sizes: Array, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, int], counts: Array
 ) -> tuple[Array, BoolArray, _Terms, Array]:
-    """Logarithms of the factors (a + b + 1,) for entries of these sizes and orders (2, a, b).
+    """Logarithms of the factors (a + b + 1,) of a matrix (a, b) with entries of these sizes (e,).
 
-    And which of them count, not those that turn out to be rounding, their terms and logarithms.
+    Their rows i, columns j and powers of τ, and how often their squares count. Beside the factors
+    stands which of the entries count, not those that turn out to be rounding, their terms and
+    logarithms.
     """
     there = sizes > 0.0
     while True:
-        few = sum(sizes.shape[1:]) <= 2 * _KEPT
-        balancing = _balancing if few else _balancing.__wrapped__
-        terms, nearest = balancing(there.tobytes(), order.tobytes(), sizes.shape, mass)
-        logs = np.log(sizes[there])
-        factors = nearest(logs)
+        of_time, logs = order[there].astype(np.float64), np.log(sizes[there])
+        terms = _Terms(i[there], shape[0] + j[there], of_time, sum(shape) + 1)
+        factors = terms.nearest(counts[there], logs)
         rest = terms.counting(factors, logs)
         if rest.all():
             return factors, there, terms, logs
@@ -152,11 +148,6 @@ class _Terms(NamedTuple):
     columns: IntArray  # (e,) after all rows
     of_time: Array  # (e,)
     total: int  # a + b + 1: how many factors there are
-
-    @classmethod
-    def at(cls, i: IntArray, j: IntArray, order: IntArray, shape: tuple[int, ...]) -> _Terms:
-        """For entries (e,) of rows i and columns j of a matrix of this shape, with τ^order each."""
-        return cls(i, shape[0] + j, order.astype(np.float64), sum(shape) + 1)
 
     def __matmul__(self, factors: Array) -> Array:
         """What the factors (a + b + 1,) add to each logarithm, (e,)."""
@@ -203,22 +194,6 @@ class _Terms(NamedTuple):
         from scipy.sparse.linalg import splu
 
         return np.asarray(splu(csc_array((values, (down, across)), shape=(n, n))).solve(right))
-
-
-@lru_cache(maxsize=64)
-def _balancing(
-    there: bytes, order: bytes, shape: tuple[int, int, int], mass: float
-) -> tuple[_Terms, Callable[[Array], Array]]:
-    """The terms, and :meth:`_Terms.nearest` with those of E counted ``mass`` times."""
-    kind, i, j = np.frombuffer(there, dtype=np.bool_).reshape(shape).nonzero()
-    derivative = np.frombuffer(order, np.int8).reshape(shape)[kind, i, j]
-    terms = _Terms.at(i, j, kind + derivative - 1, shape[1:])
-    counts = np.where(kind, 1.0, mass)
-    if terms.total > 2 * _KEPT + 1 or terms.total * len(counts) > _SOLVED:
-        return terms, partial(terms.nearest, counts)
-    each = np.array([terms @ factor for factor in np.eye(terms.total)])
-    inverse = np.linalg.pinv((each * counts) @ each.T, rcond=_SINGULAR, hermitian=True)
-    return terms, partial(np.matmul, -inverse @ (each * counts))
 
 
 def _first_of_each_part(linked: BoolArray, order: IntArray) -> IntArray:

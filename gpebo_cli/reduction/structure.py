@@ -46,6 +46,9 @@ class Pivots(NamedTuple):
     Z1: Array  # (n, d) orthonormal, completes the constraints at that time
 
 
+_NO_PIVOTS = Pivots(np.zeros(0, np.intp), np.zeros(0, np.intp), 0, np.zeros((0, 0)))
+
+
 @dataclass(frozen=True, eq=False)
 class Structure:
     """The characteristic values of the system and how they were judged."""
@@ -53,15 +56,16 @@ class Structure:
     mu: int  # strangeness index μ
     a: int  # number of constraints
     d: int  # number of differential equations, n − a
-    scaling: Scaling = field(repr=False)
-    rank_tol: float
     # Smallest one counted as nonzero, relative, at the probes where a bound of it is smallest.
     smallest_singular_value: float
     time_invariant: bool  # E and A are constant
-    reference: Pivots = field(repr=False)  # of one time, to start from at the others
-    steady: bool  # no singular value behind the ranks comes near zero between the ends
+    # What follows is of derivative arrays and stages alone.
+    scaling: Scaling = field(default=Scaling(np.ones(0), np.ones(0), 1.0), repr=False)
+    rank_tol: float = 0.0
+    reference: Pivots = field(default=_NO_PIVOTS, repr=False)  # of one time, for all the others
+    steady: bool = True  # no singular value behind the ranks comes near zero between the ends
     # z' = this z + … with z = Z1ᵀE x: Z1ᵀA T, [Z1ᵀE; Â2] T = [I; 0]; None where not determined
-    dynamics: Array | None = field(repr=False)  # (N or 1, d, d) at the probes, 1/s
+    dynamics: Array | None = field(default=None, repr=False)  # (N or 1, d, d) at the probes, 1/s
     # Ranks of E, see ``stages.py``, where the derivative array does not tell them clearly.
     stages: tuple[int, ...] = ()
 
@@ -79,16 +83,6 @@ class Structure:
     def growth(self) -> float:
         """Largest real part of its eigenvalues at the probes, 1/s, or zero."""
         return 0.0 if self.dynamics is None else float(growth_rates(self.dynamics).max())
-
-
-def without_equations() -> Structure:
-    """That of a system without states: there is nothing to reduce."""
-    none, ones = np.zeros(0, dtype=np.intp), np.ones(0)
-    return Structure(
-        mu=0, a=0, d=0, scaling=Scaling(ones, ones, 1.0), rank_tol=0.0,
-        smallest_singular_value=np.inf, time_invariant=True,
-        reference=Pivots(none, none, 0, np.zeros((0, 0))), steady=True, dynamics=None,
-    )
 
 
 def who(system: DescriptorSystem) -> str:
@@ -146,7 +140,7 @@ def _analysed(
         found = Structure(
             mu=mu, a=levels.a, d=system.n - levels.a, scaling=scaling, rank_tol=rank_tol,
             smallest_singular_value=levels.least, time_invariant=invariant,
-            reference=levels.reference, steady=True,
+            reference=levels.reference,
             dynamics=None if levels.dynamics is None else levels.dynamics / scaling.time,
         )
         if not invariant:
@@ -234,14 +228,14 @@ def _in_stages(
     steady = len(t) == 1 or follow_dips(
         t, stages.smallest, rank_tol, lines, partial(_rank_changes, system)
     )
-    none, n, a = np.zeros(0, dtype=np.intp), system.n, stages.A2.shape[1]
+    n, a = system.n, stages.A2.shape[1]
     E, A = (matrix[0] * (s.rows[:, None] * s.columns) for matrix in (c.E, c.A))
     W1 = transpose(stages.Z1)
     inverse, singular = inverse_or_none(np.concatenate([W1 @ E / s.time, stages.A2], axis=1))
     return Structure(
         mu=mu, a=a, d=n - a, scaling=s, rank_tol=rank_tol,
         smallest_singular_value=float(stages.smallest[:, :3].min()), time_invariant=len(t) == 1,
-        reference=Pivots(none, none, 0, np.zeros((n, 0))), steady=steady,
+        steady=steady,
         dynamics=None if singular.any() else W1 @ A @ inverse[:, :, : n - a] / s.time,
         stages=ranks,
     )

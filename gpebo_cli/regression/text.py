@@ -45,7 +45,7 @@ from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.recordings.drive import driven, tables
-from gpebo_cli.reduction.structure import without_equations
+from gpebo_cli.reduction.structure import Structure
 from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.operators import Operator, OperatorState
 from gpebo_cli.regression.parametrisation import Parametrisation, read_box
@@ -476,8 +476,9 @@ def simulation_of(
         signals = mesh.along(signals)
     theta = np.broadcast_to(system.initial_state, (*mesh.points.shape, system.n))
     return Simulation(
-        Signals(signals, Trajectory(mesh, outputs), Trajectory(mesh, theta)), without_equations(),
-        system.initial_state, (), solver.tol, bounded=bounded,
+        Signals(signals, Trajectory(mesh, outputs), Trajectory(mesh, theta)),
+        Structure(0, 0, 0, np.inf, time_invariant=True), system.initial_state, (), solver.tol,
+        bounded=bounded,
     )
 
 

@@ -41,7 +41,7 @@ def underlying_ode(
     the constraints slowly; the tolerance of the check is chosen accordingly.
     """
     n, scaling = system.n, structure.scaling
-    M, N, g = _array(system, structure, t, inside, structure.mu + 1)
+    M, N, g, _, _ = _array(system, structure, t, inside, structure.mu + 1)
     inverse = np.linalg.pinv(M, rcond=structure.rank_tol)[:, :n]
     # Back from x̃ = x/columns and time t/τ.
     back = scaling.columns[:, None] / scaling.time
@@ -50,15 +50,15 @@ def underlying_ode(
 
 def _array(
     system: DescriptorSystem, structure: Structure, t: Array, inside: Array, mu: int
-) -> tuple[Array, Array, Array]:
-    """M, N and g (N, (μ + 1) n, 1) of the derivative array, scaled."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """M, N and g (N, (μ + 1) n, 1) of the derivative array, scaled, and E and A it is made of."""
     c = system.coefficients.taylor(t, mu, inside)
     scaling = structure.scaling
     e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
     M, N = derivative_array(e, a, mu)
     weights = (scaling.time ** np.arange(mu + 1))[:, None] * scaling.rows
     g = np.moveaxis(forcing(c) * weights[:, None, :], 0, 1).reshape(len(t), -1, 1)
-    return M, N, g
+    return M, N, g, e, a
 
 
 def consistent_start(
@@ -70,9 +70,7 @@ def consistent_start(
     does. The consistent p are those that the constraints of that equation leave.
     """
     scaling, x0, mu = structure.scaling, system.initial_state, structure.mu
-    M, N, g = _array(system, structure, t, inside, mu)
-    c = system.coefficients.taylor(t, mu, inside)
-    e, a = scaled(c.E, c.A, scaling.rows, scaling.columns, scaling.time, mu + 1)
+    M, N, g, e, a = _array(system, structure, t, inside, mu)
     slope = np.arange(1, mu + 1)[:, None, None, None] * e[1:]
     turned = -a - np.concatenate([slope, 0.0 * e[:1]])  # more of E' has no effect
     adjoint = derivative_array(np.swapaxes(e, 2, 3), np.swapaxes(turned, 2, 3), mu)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
@@ -42,7 +41,7 @@ from gpebo_cli.reduction.explicit import (
     sizes_of,
 )
 from gpebo_cli.reduction.scaling import Scaling
-from gpebo_cli.reduction.structure import Structure, analyse, index_above, without_equations
+from gpebo_cli.reduction.structure import Structure, analyse, index_above
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.known import (
     SHORT,
@@ -154,9 +153,9 @@ class _Plant:
     def structure(self) -> Structure:
         """As elimination found it."""
         form = self.form
-        return replace(
-            without_equations(), mu=form.mu, a=self.system.n - form.d, d=form.d,
-            smallest_singular_value=form.pivot, time_invariant=len(form.matrix.entries) == 1,
+        return Structure(
+            mu=form.mu, a=self.system.n - form.d, d=form.d, smallest_singular_value=form.pivot,
+            time_invariant=len(form.matrix.entries) == 1,
         )
 
     def matrix_tail(self, mesh: Mesh, form: Explicit | ConstantForm) -> Array:

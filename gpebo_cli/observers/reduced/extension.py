@@ -106,8 +106,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     # Along axes offset and gain are these components, each compared with its own state's size.
     # Where the kernel turns, they lose what is eliminated.
     on_axes = bool(np.count_nonzero(basis) == basis.shape[1] == reduced.first.split.rank)
-    axes = basis if on_axes and large and (basis.max(axis=0) == 1.0).all() else None
-    monitor = _Monitor(reduced, units, axes)
+    monitor = _Monitor(reduced, units)
     problem = LinearProblem(coefficients, start / units, monitor, name, told=on_axes)
     known, signals = None, reduced.signals
     limits: dict[str, Any] = {"tol": solver.tol, "max_elements": solver.max_elements}
@@ -119,7 +118,7 @@ def extend(reduced: ReducedSystem, mesh: Mesh, start: Array) -> Extension:
     marched = series.solve_dense(problem, mesh, **limits, known=known) if large else None
     if marched is not None:
         return _assembled(reduced, units, marched, monitor.latest, as_found=True)
-    known, large, monitor.axes = None if large else known, False, None
+    known, large = None if large else known, False
     if len(windows) > 1:
         return joined(kept_of(_over(mesh, reduced, problem, monitor), mesh, signals.asked))
     own = ivp.solve if solver.name == "ivp" else partial(solve, known=known)
@@ -134,9 +133,9 @@ class _Monitor:
     has decayed is still measured by the size it had.
     """
 
-    def __init__(self, reduced: ReducedSystem, units: Array, axes: Array | None) -> None:
-        """For coordinates in units (k, 1 + p); axes as of ``kinds``."""
-        self._reduced, self.units, self.axes = reduced, units, axes
+    def __init__(self, reduced: ReducedSystem, units: Array) -> None:
+        """For coordinates in units (k, 1 + p)."""
+        self._reduced, self.units = reduced, units
         self._past: Sequence[Array] = ()
         self._whole: Sequence[Array] = ()
         self.latest: Assembled  # with what stands in front
@@ -162,12 +161,8 @@ class _Monitor:
         reduced, rounding = self._reduced, self._reduced.first.rounding
         if rounding is not None:
             rounding = ROUNDING * EPS / reduced.solver.tol * rounding
-        kinds = self.latest.kinds(reduced.form.units.states, self.axes, rounding, equations)
-        for signal, floor in kinds:
-            if signal is not None:
-                yield signal.reshape(*self._whole[0].shape[:2], -1), floor
-            else:
-                yield None, np.insert(floor / self.units[:, 1:], 0, np.inf, axis=1).ravel()
+        for signal, floor in self.latest.kinds(reduced.form.units.states, rounding, equations):
+            yield signal.reshape(*self._whole[0].shape[:2], -1), floor
 
     def next_window(self, size: int) -> Assembled:
         """What is made of the window of that size, which comes to stand before the next one."""

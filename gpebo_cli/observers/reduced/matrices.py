@@ -294,12 +294,11 @@ def _moving(
 
     Λ = E⁺A + Ṗ, K = ``K`` Q1ᵀ; the last three matrices are the ``equations``. Times (N or 1).
     """
-    Lambda = split.inward(A)
+    Lambda, of_F, of_B = (exact_product(split.pinv, matrix) for matrix in (A, F, B))
     if split.turn is not None:
         Lambda = Lambda + split.turn
-    of_B = split.inward(B)
     none = np.zeros((1, of_B.shape[1], equations[2].shape[2] - B.shape[2]))
-    direct = [across(Lambda, split.basis), split.inward(F), joined(of_B, none, axis=2)]
+    direct = [across(Lambda, split.basis), of_F, joined(of_B, none, axis=2)]
     given = K.any(axis=(0, 2))
     back = Lambda[:, :, given] @ K[:, given]
     moved = back.any(axis=(0, 2))  # of many states few are moved by those that are eliminated

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from gpebo_cli import kernels
-from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.linalg import largest_over_time, orthonormal_complement, transpose
+from gpebo_cli.numerics.mesh import Kind
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations
 from gpebo_cli.reduction.form import EquationForm
 
@@ -33,35 +33,26 @@ class Assembled:
     gain: Array  # (N, n, p)
     Y_scale: float  # size of the terms of Y before they cancel
     column_scale: Array  # (p,) and of the columns of ψ: each has the unit of its parameter
-    eliminated: BoolArray  # (n,) states that take part in what is eliminated
     largest: Array  # (k, 1 + p) sizes of z over time
     moving: Array  # (n, p) of the gain of w = P x, which the eliminated part may cancel
 
     def kinds(
-        self, units: Array | float = 1.0, basis: Array | None = None,
-        rounding: Array | None = None, equations: AlgebraicEquations | None = None,
-    ) -> Iterator[tuple[Any, Any]]:
+        self, units: Array | float = 1.0, rounding: Array | None = None,
+        equations: AlgebraicEquations | None = None,
+    ) -> Iterator[Kind]:
         """Everything the mesh has to resolve, with the size below which it is rounding.
 
         States have ``units`` (n,), in which they are comparable. Signals come one after the other,
-        because all of a long recording take much memory.
-        States that are coordinates of z along a ``basis`` of axes are not copied: instead of their
-        gain None comes, with the units (k, p) that z without ξ_a is to be measured in. What
-        ``rounding`` (n, n) of w leaves of a state is no signal to resolve, nor is what is left of
-        a state whose terms cancel, those of the ``equations`` that all of this comes from.
+        because all of a long recording take much memory. What ``rounding`` (n, n) of w leaves of a
+        state is no signal to resolve, nor is what is left of a state whose terms cancel, those of
+        the ``equations`` that all of this comes from.
         """
         columns = self._columns
         rows, Y, psi = self._rows, self.Y, self.psi
         if len(rows) < Y.shape[1]:
             Y, psi = Y[:, rows], psi[:, rows]
         psi = psi / columns[None].repeat(psi.shape[1], axis=0)
-        others: BoolArray = np.ones(len(self.moving), dtype=bool)
-        if basis is not None:
-            others = self.eliminated | ~basis.any(axis=1)
-        gain, largest = self.gain, self.moving.copy()
-        if not others.all():
-            gain = gain[:, others]
-        largest[others] = largest_over_time(gain)
+        largest = largest_over_time(self.gain)
         states = (largest / columns).max(axis=1, initial=0.0)
         if self.Y_scale > 0.0:  # a state that no parameter has part in is no signal to resolve
             own = largest_over_time(self.offset) / self.Y_scale
@@ -79,9 +70,7 @@ class Assembled:
         yield psi, 1e-3
         yield self.offset / units, 0.0
         units = np.where(states > 0.0, states, 1.0)[:, None] * columns
-        yield gain / units[others], 0.0
-        if basis is not None and not others.all():
-            yield None, basis.T @ units
+        yield self.gain / units, 0.0
         # Of ψᵀψ the diagonal: a product of two columns that are resolved shows no more than theirs.
         yield (psi**2).sum(axis=1), 1e-3
         yield np.einsum("nrp,nr->np", psi, Y), 1e-3 * self.Y_scale
@@ -146,9 +135,9 @@ def regression_signals(z: Array, basis: Array, equations: AlgebraicEquations) ->
         sizes = np.maximum(sizes, (np.abs(algebraic) @ np.abs(z)).max(axis=(0, 1), initial=0.0))
         nothing = np.abs(psi).max(axis=(0, 1), initial=0.0) <= VANISHING * sizes[1:]
         psi = np.where(nothing, 0.0, psi)
-    largest, used = largest_over_time(z), np.asarray(largest_over_time(H).any(axis=1))
+    largest = largest_over_time(z)
     moving = np.abs(basis) @ largest[:, 1:]
-    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], used, largest, moving)
+    return Assembled(Y, psi, offset, gain, float(sizes[0]), sizes[1:], largest, moving)
 
 
 def resolve(found: Assembled, some: slice, terms: Array, form: EquationForm) -> None:

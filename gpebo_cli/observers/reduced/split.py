@@ -8,13 +8,13 @@ dual (k, n), dual B = I and dual P = dual. Coordinate axes are their own dual.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from gpebo_cli.errors import ModelError
-from gpebo_cli.kernels.arrays import across, axes_of, down, inverses
+from gpebo_cli.kernels.arrays import across, down, inverses
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.numerics.linalg import (
     exact_product,
@@ -42,14 +42,6 @@ class Split:
     kernel: Array  # (N, n, n_b) orthonormal in comparable units
     projector: Array  # (N, n, n) P
     frame: Frame | None  # None where kernel or range turn
-    scales: Array | None = None  # (N, n_a) of rows of E along axes, if each has one such state
-
-    def inward(self, matrix: Array) -> Array:
-        """E⁺ times a matrix (N, n, c) as z has it, (N, k, c)."""
-        if self.scales is None or self.frame is None:
-            return exact_product(self.pinv, matrix)
-        part = down(self.frame.range.T, matrix)
-        return part if (self.scales == 1.0).all() else part / self.scales[:, :, None]
 
     def coordinates(self, states: tuple[str, ...], units: Array) -> tuple[str, ...]:
         """Names of w's coordinates z, (k,), from those of the states and their units (n,)."""
@@ -146,15 +138,7 @@ def split_in_frame(E: Array, frame: Frame, units: Array, rank_tol: float) -> Spl
     ]
     if not fits(outside, size, B.shape[1], norms[0], norms[1], rank_tol):
         return None
-    pinv = np.zeros((len(E), len(own), len(units)))
-    if (axes := axes_of(U)) is not None:
-        pinv[:, :, axes] = inverse / own[:, None]
-    else:
-        np.matmul(inverse / own[:, None], U.T, out=pinv)
-    found = within_frame(frame, pinv)
-    if alone and axes is not None and frame.remaining is None:
-        return replace(found, scales=diagonal * own)
-    return found
+    return within_frame(frame, inverse / own[:, None] @ U.T)
 
 
 def fits(

@@ -22,7 +22,7 @@ import numpy as np
 
 from gpebo_cli.kernels import arrays
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.numerics.mesh import Mesh, Trajectory
+from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
 from gpebo_cli.observers.reduced.extension import Extension, joined, kept_of
@@ -34,9 +34,7 @@ from gpebo_cli.regression.linear import LinearRegression
 
 _APART = 1e4  # times what w does to itself: beside more float64 numbers lose it
 # Times and where jumps are decided, (2, K, s + 1); the rest at these; what the mesh has to resolve.
-_Evaluated: TypeAlias = tuple[
-    Array, Assembled, Array, tuple[float, float], list[tuple[Array, float]]
-]
+_Evaluated: TypeAlias = tuple[Array, Assembled, Array, tuple[float, float], list[Kind]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +81,7 @@ class CurrentCoordinates:
         size = np.abs(np.concatenate([start.G, start.on_basis], axis=2) * units).max(initial=0.0)
         past = np.zeros((2, 0, len(reduced.mesh.rule.points)))
 
-        def evaluate(mesh: Mesh) -> tuple[_Evaluated, list[tuple[Array, float]]]:
+        def evaluate(mesh: Mesh) -> tuple[_Evaluated, list[Kind]]:
             times = np.concatenate([past, [mesh.points, mesh.inside]], axis=1)
             t, inside = times.reshape(2, -1)
             o = reduced.matrices(t, inside)
