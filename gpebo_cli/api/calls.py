@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from copy import deepcopy
 from dataclasses import fields, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
 
 from gpebo_cli import observers
-from gpebo_cli.api.choice import Draft, choose, folders
+from gpebo_cli.api.choice import choose, folders
 from gpebo_cli.api.result import Result
 from gpebo_cli.configs import configuration
 from gpebo_cli.configs.files import is_file, shipped
@@ -31,7 +31,9 @@ from gpebo_cli.settings import NoiseSettings, Settings, SolverSettings
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Plant = str | os.PathLike[str] | Mapping[str, object] | Draft | DescriptorSystem
+    from gpebo_cli.importers.draft import PlantDraft
+
+Plant: TypeAlias = "str | os.PathLike[str] | Mapping[str, object] | PlantDraft | DescriptorSystem"
 Choice = str | Mapping[str, object]
 EstimatorChoice = Choice | Estimator
 Folder = str | os.PathLike[str]

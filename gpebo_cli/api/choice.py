@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from functools import cache
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 from gpebo_cli.configs import files, locations
 from gpebo_cli.configs.locations import choices, conf_folder
@@ -19,14 +19,6 @@ from gpebo_cli.registry import installed
 from gpebo_cli.schema import nearest, plain, shown
 
 _WHOLE = ("plant", "regression")  # a mapping or a file of these is all of it
-
-
-@runtime_checkable
-class Draft(Protocol):
-    """A plant under construction, such as :class:`~gpebo_cli.importers.draft.PlantDraft`."""
-
-    def mapping(self) -> Mapping[str, object]:
-        """The plant as the plain data of its file."""
 
 
 default = cache(locations.default)  # a run asks for every group
@@ -42,7 +34,7 @@ def choose(
     path of a file, or a mapping or draft that is the whole of it (ConfigError: nothing has that
     name).
     """
-    if group in _WHOLE and isinstance(given, Draft):
+    if group in _WHOLE and hasattr(given, "mapping"):
         given = given.mapping()
     if group in _WHOLE and isinstance(given, Mapping):
         return dict(given), ""
