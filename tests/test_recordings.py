@@ -958,7 +958,7 @@ DAYS = "column time (days) may be in days, t is in s: data.scale.t is the factor
 @pytest.mark.parametrize(("head", "time", "said"), [
     ("when,v [A],Y", "0", {
         "columns": {"t": "when", "V": "v [A]", "y": "Y"}, "time_unit": "s", "scale": {"V": 1.0},
-        "reasons": {"t": "the first column", "time_unit": "not said in the file",
+        "reasons": {"t": "the first column: LOOK AT IT", "time_unit": "not said in the file",
                     "V": "by elimination: LOOK AT IT", "y": "the same name but for capitals",
                     "scale.V": "A in the header, V here: WHICH FACTOR?"},
         "doubts": ["column v [A] may be in A, V is in V: data.scale.V is the factor between them"],
@@ -981,6 +981,21 @@ def test_each_guess_has_its_reason_and_each_doubt_is_told(tmp_path, head, time, 
     (tmp_path / "lab.csv").write_text(f"{head}\n{time},1,2{',a' * head.count('note')}\n")
     found = guess(str(tmp_path / "lab.csv"), shipped("circuit"))
     assert {key: getattr(found, key) for key in said} == said
+
+
+def test_a_row_of_units_and_numbers_of_rows_are_said(tmp_path):
+    path = tmp_path / "lab.csv"
+    path.write_text("t (ms);V;y\n[ms];[V];[A]\n0;1,5;2\n10;1,6;2\n")
+    found = guess(str(path), shipped("circuit"))
+    assert (found.time_unit, found.decimal, found.columns["t"]) == ("ms", ",", "t (ms)")
+    assert found.doubts == [
+        "column t (ms): '[ms]' above its numbers; such rows have to be removed"
+    ]
+    told = "column # may count rows: data.scale.t is the time between them in seconds"
+    for name, first, doubts in ("#", 0, [told]), ("#", 1, [told]), ("#", 2, []), ("t", 0, []):
+        rows = "".join(f"{first + k},1,2\n" for k in range(3))
+        path.write_text(f"{name},V,y\n{rows}")
+        assert guess(str(path), shipped("circuit")).doubts == doubts
 
 
 def test_an_input_that_steps_is_guessed_to_be_held(tmp_path):
