@@ -606,6 +606,9 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         read("", frame=pd.DataFrame(good).iloc[:1])
     with refused("row 1, column t: nan"):  # whatever is done about gaps of signals
         read("", frame=pd.DataFrame(good | {"t": [0.0, np.nan, 1.0]}), missing="hold")
+    with refused("row 0, column V: inf is no number") as told:  # and no gap
+        read("", frame=pd.DataFrame(good | {"V": [np.inf, 1.0, 2.0]}), missing="drop")
+    assert "data.missing" not in str(told.value)
     back = {"t": [0.0, 0.5, 0.2], "V": [1.0, 2.0, np.nan]}
     with refused("0.2 follows 0.5; times must increase"):  # where a signal is missing, too
         read("", frame=pd.DataFrame(good | back), missing="hold")

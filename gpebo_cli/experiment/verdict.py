@@ -87,7 +87,8 @@ def _explains(fit: Fit, case: int) -> str:
     residual = fit.residual[case]
     if residual > WORSE * fit.least and residual > _EXACT * fit.size:
         return f", where least squares of the same data leave {fit.least:.2g}: {_OF_ESTIMATES}"
-    noise, why = "", "a missing or wrong parameter, a drifting sensor, or a delay"
+    noise = ""
+    why = "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
     if fit.ratio is not None:
         noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
     if fit.correlation is None:  # all outputs are used up for states
