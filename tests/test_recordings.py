@@ -994,6 +994,8 @@ def test_a_row_of_units_and_numbers_of_rows_are_said(tmp_path):
     assert found.doubts == [
         "column t (ms): '[ms]' above its numbers; such rows have to be removed"
     ]
+    path.write_text("t;V;y\n0;999;2\n1;1,001;2\n")  # a thousand, as a person sees who reads it
+    assert guess(str(path), shipped("circuit")).reasons["decimal"] == "numbers such as 1,001"
     told = "column # may count rows: data.scale.t is the time between them in seconds"
     for name, first, doubts in ("#", 0, [told]), ("#", 1, [told]), ("#", 2, []), ("t", 0, []):
         rows = "".join(f"{first + k},1,2\n" for k in range(3))

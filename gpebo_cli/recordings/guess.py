@@ -79,9 +79,10 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
 
     cells = [list(islice(known(k), _LOOKED_AT)) for k in range(len(header))]
     commas = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
-    if found.separator != "," and any(commas.fullmatch(cell) for row in rows for cell in row):
+    comma = next((cell.strip() for row in rows for cell in row if commas.fullmatch(cell)), "")
+    if found.separator != "," and comma:
         found.decimal = ","
-        found.reasons["decimal"] = "numbers such as 1,5"
+        found.reasons["decimal"] = f"numbers such as {comma}"
     _find_time(header, cells, (*system.inputs, *system.outputs), found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
