@@ -606,6 +606,9 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         read("", frame=pd.DataFrame(good).iloc[:1])
     with refused("row 1, column t: nan"):  # whatever is done about gaps of signals
         read("", frame=pd.DataFrame(good | {"t": [0.0, np.nan, 1.0]}), missing="hold")
+    with refused("row 0, column V: inf is no number") as told:  # and no gap
+        read("", frame=pd.DataFrame(good | {"V": [np.inf, 1.0, 2.0]}), missing="drop")
+    assert "data.missing" not in str(told.value)
     back = {"t": [0.0, 0.5, 0.2], "V": [1.0, 2.0, np.nan]}
     with refused("0.2 follows 0.5; times must increase"):  # where a signal is missing, too
         read("", frame=pd.DataFrame(good | back), missing="hold")
@@ -958,7 +961,7 @@ DAYS = "column time (days) may be in days, t is in s: data.scale.t is the factor
 @pytest.mark.parametrize(("head", "time", "said"), [
     ("when,v [A],Y", "0", {
         "columns": {"t": "when", "V": "v [A]", "y": "Y"}, "time_unit": "s", "scale": {"V": 1.0},
-        "reasons": {"t": "the first column", "time_unit": "not said in the file",
+        "reasons": {"t": "the first column: LOOK AT IT", "time_unit": "not said in the file",
                     "V": "by elimination: LOOK AT IT", "y": "the same name but for capitals",
                     "scale.V": "A in the header, V here: WHICH FACTOR?"},
         "doubts": ["column v [A] may be in A, V is in V: data.scale.V is the factor between them"],
@@ -981,6 +984,23 @@ def test_each_guess_has_its_reason_and_each_doubt_is_told(tmp_path, head, time, 
     (tmp_path / "lab.csv").write_text(f"{head}\n{time},1,2{',a' * head.count('note')}\n")
     found = guess(str(tmp_path / "lab.csv"), shipped("circuit"))
     assert {key: getattr(found, key) for key in said} == said
+
+
+def test_a_row_of_units_and_numbers_of_rows_are_said(tmp_path):
+    path = tmp_path / "lab.csv"
+    path.write_text("t (ms);V;y\n[ms];[V];[A]\n0;1,5;2\n10;1,6;2\n")
+    found = guess(str(path), shipped("circuit"))
+    assert (found.time_unit, found.decimal, found.columns["t"]) == ("ms", ",", "t (ms)")
+    assert found.doubts == [
+        "column t (ms): '[ms]' above its numbers; such rows have to be removed"
+    ]
+    path.write_text("t;V;y\n0;999;2\n1;1,001;2\n")  # a thousand, as a person sees who reads it
+    assert guess(str(path), shipped("circuit")).reasons["decimal"] == "numbers such as 1,001"
+    told = "column # may count rows: data.scale.t is the time between them in seconds"
+    for name, first, doubts in ("#", 0, [told]), ("#", 1, [told]), ("#", 2, []), ("t", 0, []):
+        rows = "".join(f"{first + k},1,2\n" for k in range(3))
+        path.write_text(f"{name},V,y\n{rows}")
+        assert guess(str(path), shipped("circuit")).doubts == doubts
 
 
 def test_an_input_that_steps_is_guessed_to_be_held(tmp_path):

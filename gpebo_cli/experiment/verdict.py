@@ -27,6 +27,9 @@ _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
+_SUSPECTED = (
+    "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
+)
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
 _NOT_FED_BACK = "observer.form=strangeness_free without a remedy does not"
@@ -87,7 +90,7 @@ def _explains(fit: Fit, case: int) -> str:
     residual = fit.residual[case]
     if residual > WORSE * fit.least and residual > _EXACT * fit.size:
         return f", where least squares of the same data leave {fit.least:.2g}: {_OF_ESTIMATES}"
-    noise, why = "", "a missing or wrong parameter, a drifting sensor, or a delay"
+    noise, why = "", _SUSPECTED
     if fit.ratio is not None:
         noise = f", {fit.ratio:.2f} times what the sensors' noise makes"
     if fit.correlation is None:  # all outputs are used up for states

@@ -79,9 +79,10 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
 
     cells = [list(islice(known(k), _LOOKED_AT)) for k in range(len(header))]
     commas = re.compile(r"\s*[+-]?\d*,\d+(?:[eE][+-]?\d+)?\s*")
-    if found.separator != "," and any(commas.fullmatch(cell) for row in rows for cell in row):
+    comma = next((cell.strip() for row in rows for cell in row if commas.fullmatch(cell)), "")
+    if found.separator != "," and comma:
         found.decimal = ","
-        found.reasons["decimal"] = "numbers such as 1,5"
+        found.reasons["decimal"] = f"numbers such as {comma}"
     _find_time(header, cells, (*system.inputs, *system.outputs), found)
     _find_signals(header, cells, system, found)
     taken = [header.index(name) for name in found.columns.values()]
@@ -130,8 +131,14 @@ def _find_time(
     # Of a date beside a time of day the one that moves.
     k = max(named, key=lambda k: len(set(cells[k]))) if named else 0
     found.columns[TIME] = header[k]
-    found.reasons[TIME] = "by its name" if named else "the first column"
+    found.reasons[TIME] = "by its name" if named else "the first column: LOOK AT IT"
     numbers = [_number(cell, found.decimal) for cell in cells[k]]
+    above = next((j for j, number in enumerate(numbers) if number is not None), 0)
+    if above and None not in numbers[above:]:  # a row of units below the header
+        found.doubts.append(
+            f"column {header[k]}: {cells[k][0]!r} above its numbers; such rows have to be removed"
+        )
+        numbers = numbers[above:]
     if any(number is None for number in numbers):
         found.time_unit = "datetime"
         first = cells[k][0]
@@ -144,6 +151,11 @@ def _find_time(
     units = [_UNITS[word] for word in words if word in _UNITS]
     found.time_unit = units[0] if units else "s"
     found.reasons["time_unit"] = "from the header" if units else "not said in the file"
+    counted = ([str(first + j) for j in range(len(cells[k]))] for first in (0, 1))
+    if not named and cells[k][2:] and list(cells[k]) in counted:
+        found.doubts.append(
+            f"column {header[k]} may count rows: data.scale.t is the time between them in seconds"
+        )
     written = [word for word in words if _factor(word, "s")] or _units(header[k])
     if written and not units:
         _find_scale(TIME, header[k], written[0], "s", found)

@@ -9,7 +9,8 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
-from gpebo_cli.model.text import TextCoefficients
+from gpebo_cli.model.expressions import aside, switched, with_others
+from gpebo_cli.model.text import TextCoefficients, sided
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, beside_edges
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
@@ -87,6 +88,11 @@ def load(
     if isinstance(system.coefficients, TextCoefficients):
         edges, also = system.coefficients.along(both.cells, range(m + system.r), edges)
         bounded = bounded and also
+    arguments = sided(system.coefficients)
+    if arguments is not None:  # signals pass what jumps, as step does in C, between samples, too
+        t = aside(mesh.points, mesh.inside).ravel()
+        passed = switched(arguments, t, lambda t, order: both.taylor(t, order, t))
+        edges = with_others(edges, passed)
     if len(edges) > len(mesh.edges):
         mesh = Mesh(edges, mesh.rule)
         both = mesh.along(both)

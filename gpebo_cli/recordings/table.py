@@ -280,7 +280,8 @@ def _from_frame(
     for row, k in np.argwhere(wrong)[:1]:
         raise ConfigError(
             f"{source}, row {row}, column {header.names[k]}: {values[row, k]} is no number "
-            f"within ±{LARGEST:g}; data.missing says what to do about gaps"
+            f"within ±{LARGEST:g}"
+            + "; data.missing says what to do about gaps" * bool(np.isnan(values[row, k]))
         )
     if data.missing == "drop":
         values[1:][np.diff(values[:, 0]) == 0.0] = np.nan
