@@ -21,7 +21,7 @@ from gpebo_cli.model.descriptor import Coefficients
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.reduction import strangeness_free as reductions
 from gpebo_cli.reduction.consistency import consistent_state, jumps
-from gpebo_cli.reduction.scaling import balance, balance_entries, scales_of, units_at
+from gpebo_cli.reduction.scaling import _Terms, balance, balance_entries, scales_of, units_at
 from gpebo_cli.reduction.stages import UnclearError, _Rounding, _without_dust, in_stages
 from gpebo_cli.reduction.strangeness_free import (
     _by_singular_vectors,
@@ -205,6 +205,18 @@ def test_scales_are_those_of_weighted_least_squares(seed, n, mass):
     best = terms @ np.linalg.lstsq(weights[:, None] * terms, -weights * logs)[0]
     found = terms @ np.log2([*s.rows, *s.columns, s.time])
     assert np.abs(found - best).max() <= 1.5 + 1e-9
+
+
+@pytest.mark.parametrize("mass", [1.0, 1e3])
+def test_a_factor_that_entries_leave_open_is_no_rounding(mass):
+    """Rows times a number, columns over it, are the same: of such factors the least are found."""
+    rng, n = np.random.default_rng(0), 12
+    there = rng.random((2, n, n)) < 0.25
+    there[1, range(n), range(n)] = there[1, :, 0] = True  # all of them hang together
+    kind, i, j = there.nonzero()
+    logs = rng.uniform(-30.0, 30.0, len(kind))
+    factors = _Terms(i, n + j, kind - 1.0, 2 * n + 1).nearest(np.where(kind, 1.0, mass), logs)
+    assert abs(factors[:n].sum() - factors[n:-1].sum()) < 1e-3
 
 
 @settings(deadline=None, max_examples=30)

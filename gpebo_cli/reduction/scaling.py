@@ -20,7 +20,7 @@ from gpebo_cli.numerics.linalg import largest_over_time
 _NOTHING = 1e-13  # entries below this, after scaling, are rounding
 _ROUNDS, _LITTLE = 3, 1e-4  # of weighing entries by their squares; the least of these
 _SCALED = 16  # rounds in which rows and columns are brought to the size one
-_OPEN = 1e-11  # added to squares of terms: directions that they leave open come to nothing
+_OPEN = 1e-10  # of the largest, added to squares: directions that are open come to nothing
 _FULL = 400  # factors, up to which their equations are solved as full ones
 _DECADES = 24.0  # of the unit of an unknown, at most: what rises later may be next to nothing yet
 _BESIDE_TIES = 0.1234  # decades: where factors are rounded, halves and thirds are not at an edge
@@ -182,7 +182,7 @@ class _Terms(NamedTuple):
         n, right = self.total, -self.transposed(logs * counts)
         with_time, own = (self.transposed(x * counts) for x in (self.of_time, 1.0))
         own[-1] = with_time[-1]
-        own += _OPEN
+        own += _OPEN * counts.max(initial=1.0)
         every, last, with_time[-1] = np.arange(n), np.full(n, n - 1), 0.0
         values = np.concatenate([counts, counts, own, with_time, with_time])
         down = np.concatenate([self.rows, self.columns, every, every, last])
