@@ -83,6 +83,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun if number == 1 else plural}"
 
 
+def instant(t: float, digits: int = 4) -> str:
+    """A time in seconds as messages tell it: in digits, a large one to hundredths."""
+    return f"{t:.{digits}g}" if abs(t) < 10.0**digits else f"{round(t, 2):.15g}"
+
+
 def shown(value: object) -> str:
     """A value as a message repeats it: on one line, printable, and not too long."""
     try:

@@ -32,6 +32,7 @@ from gpebo_cli.results.provenance import GitState, Provenance
 from gpebo_cli.results.report import case_table, estimate_table, loud_lines, noise_table
 from gpebo_cli.results.symbols import number_text, with_unit
 from gpebo_cli.results.tables import write_noise
+from gpebo_cli.schema import instant
 
 FAST = ("time.samples=51", "time.horizon=8")
 
@@ -67,6 +68,20 @@ def test_an_estimate_stands_since_it_is_within_a_hundredth_of_its_end():
     found = run(plant, estimator="gradient", gamma=2, time={"horizon": 10, "samples": 11})
     (row,) = [line for line in estimate_table(found.details) if "e0_x" in line]
     assert "  3 s  " in row
+
+
+def test_times_of_a_clock_are_told_to_hundredths_of_a_second():
+    start = 1764259200.0
+    t = start + np.arange(0.0, 10.01, 0.05)
+    plant = {"name": "still", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[0]],
+             "C": [[1]], "initial_state": [1]}
+    found = run(plant, estimator="least_squares", data={"t": t, "y": np.cos(t)})
+    since = [found.excitation.t_c, found.excitation.determined]
+    assert f"interval-exciting from t = {round(since[0], 2):.15g} s on" in found.verdict
+    assert f"well determined from t = {round(since[1], 2):.15g} s on" in found.verdict
+    (row,) = [line for line in estimate_table(found.details) if "e0_x" in line]
+    assert row.count("  1764259") + row.count("from 1764259") == 2
+    assert [instant(x) for x in (0.0496249, 9999.4, 20000.0)] == ["0.04962", "9999", "20000"]
 
 
 def test_every_cell_of_the_table_of_estimates():

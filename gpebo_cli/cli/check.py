@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gpebo_cli.cli import arguments as command_line
 from gpebo_cli.errors import ConfigError
+from gpebo_cli.schema import instant
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.assumptions import Examination
@@ -92,7 +93,7 @@ def _knowledge(examined: Examination) -> list[str]:
     width, lines = max(map(len, examined.estimable), default=0), []
     for name, since in examined.estimable.items():
         why = "left out by this observer" if name in examined.left_out else "cannot be known"
-        text = why if since is None else f"estimable from t = {since:.4g} s on"
+        text = why if since is None else f"estimable from t = {instant(since)} s on"
         if (deviation := examined.deviations.get(name)) is not None:
             text += f", deviation {deviation:.3g} per unit of noise of the outputs"
         lines.append(f"  {name:<{width}}  {text}")

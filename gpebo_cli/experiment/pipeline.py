@@ -30,6 +30,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.recordings.hold import holds
 from gpebo_cli.regression.text import TextRegression
+from gpebo_cli.schema import instant
 from gpebo_cli.settings import Settings
 
 
@@ -130,7 +131,7 @@ def stream_verdict(online: Online) -> str:
     """The last line of a stream: how much came, and what the one of a run says."""
     excitation, fit = online.excitation(), online.fit()
     return "; ".join([
-        f"{online.count} rows, t = {online.start:.6g} to {online.reached.t:.6g}",
+        f"{online.count} rows, t = {instant(online.start, 6)} to {instant(online.reached.t, 6)}",
         verdict(excitation, online.cases, online.requirement, fit=fit) + online.note,
         *online.doubts()[1],
     ])

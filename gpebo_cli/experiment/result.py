@@ -17,6 +17,7 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated, replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
+from gpebo_cli.schema import instant
 from gpebo_cli.settings import Settings
 
 _OUTSIDE = 0.2  # share of correlations outside a band that white noise leaves with 5 % of them
@@ -31,7 +32,7 @@ class ActiveBound:
     time: float | None  # at which the state is there; None: an unknown
 
     def __str__(self) -> str:
-        when = "" if self.time is None else f" at t = {self.time:.4g}"
+        when = "" if self.time is None else f" at t = {instant(self.time)}"
         return f"{self.name} = {self.value:g}{when}"
 
     def near(self, other: ActiveBound, distance: float) -> bool:

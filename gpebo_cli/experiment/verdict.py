@@ -21,7 +21,7 @@ from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.functions import FunctionCoefficients
 from gpebo_cli.numerics.rows import Rows
-from gpebo_cli.schema import counted
+from gpebo_cli.schema import counted, instant
 
 _MORE = 1.2  # times the sensors' noise: more than that is something else
 _LESS = 0.1  # of the sensors' noise: less than that says nothing against the model
@@ -50,12 +50,13 @@ def verdict(
         level = f"λ_min(G) = {excitation.level:.3g} with unit diagonal"
     else:
         level = f"λ_min(G) = {excitation.lambda_min:.3g}, ρ = {excitation.rho:.2g}"
-    if excitation.is_ie:
-        first = f"interval-exciting from t = {excitation.t_c:.4g} s on ({level})"
+    if excitation.t_c is not None:
+        first = f"interval-exciting from t = {instant(excitation.t_c)} s on ({level})"
         determined = excitation.determined
         if determined is not None:
-            since = f"from t = {determined:.4g} s on" if len(excitation.t) > 1 else "at the end"
-            first += f", parameters well determined {since}"  # a stream knows its end only
+            since = f"from t = {instant(determined)} s on"
+            since = since if len(excitation.t) > 1 else "at the end"  # all that a stream knows
+            first += f", parameters well determined {since}"
     else:
         first = f"NOT interval-exciting: {level}; not excited: {excitation.weakest_direction}"
     without = ("not determined by the data", unknown), ("left out by the observer", left_out)
@@ -103,7 +104,7 @@ def _explains(fit: Fit, case: int) -> str:
         of_least = "that of least squares that weigh each output by its noise is"
         return f": the residual{noise and noise + ','} is not white, {of_least}: {_OF_ESTIMATES}"
     if fit.far:
-        told = (f"{count} of {name} (first at t = {t:.6g})" for name, count, t in fit.far)
+        told = (f"{count} of {name} (first at t = {instant(t, 6)})" for name, count, t in fit.far)
         rest = "" if fit.white else (
             f"; without them the residual is not white, which they may have made, or {why}"
         )

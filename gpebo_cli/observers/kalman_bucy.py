@@ -43,7 +43,7 @@ from gpebo_cli.observers.remedies.current_coordinates import CurrentState
 from gpebo_cli.regression.errors import ErrorsAt, ErrorSystem
 from gpebo_cli.regression.estimator import Found
 from gpebo_cli.regression.linear import LinearRegression
-from gpebo_cli.schema import per_name
+from gpebo_cli.schema import instant, per_name
 from gpebo_cli.settings import NoiseSettings, SolverSettings
 
 _LEVEL = 1e-8  # of M's largest eigenvalue over all windows, in units of P(0)⁻¹: below, no evidence
@@ -341,7 +341,7 @@ def _uniform_observability(
         },
         text=(
             f"over windows of {window:.3g} s, λ_min of the observability Gramian falls to "
-            f"{level:.3g} of P0⁻¹ (from t = {at:.4g} s on; evidence needs {needed:.2g})"
+            f"{level:.3g} of P0⁻¹ (from t = {instant(at)} s on; evidence needs {needed:.2g})"
         ),
     )
 

@@ -12,6 +12,7 @@ from gpebo_cli.errors import printable
 from gpebo_cli.evidence.metrics import is_metric
 from gpebo_cli.results.names import SETTLED, known_by, shown_metrics
 from gpebo_cli.results.symbols import number_text, symbol
+from gpebo_cli.schema import instant
 
 if TYPE_CHECKING:
     from gpebo_cli.experiment.result import NoiseStatistics, RunResult
@@ -127,7 +128,8 @@ def estimate_table(result: RunResult) -> list[str]:
     for name, told in estimates_at_end(result, estimation, case).items():
         value, std, from_when = told["value"], told["std"], result.estimable.get(name)
         lasts = name in result.estimable  # the filter's w_<state> move as states do
-        estimable = "" if not lasts else "no" if from_when is None else f"from {from_when:.4g} s"
+        begins = "no" if from_when is None else f"from {instant(from_when)} s"
+        estimable = begins if lasts else ""
         if not math.isfinite(value):
             why = "left out" if name in result.left_out else "not determined"
             rows.append([name, why, "", told["unit"] or "", "", estimable])
@@ -137,7 +139,7 @@ def estimate_table(result: RunResult) -> list[str]:
         known = standing.get(name)
         when = estimation.t[first] if known is None else estimation.t[0] + known[case]
         lasts = lasts and name in estimation.names and math.isfinite(when)
-        since = f"{when:.4g} s" if lasts else ""
+        since = f"{instant(when)} s" if lasts else ""
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         shown = f"{value:.6g}"
         if estimation.still[case] and name in estimation.names:
