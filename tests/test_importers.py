@@ -723,10 +723,15 @@ def test_a_state_space_model():
 
 
 @pytest.mark.parametrize(("n", "names"), [(50, {".yaml"}), (51, {".yaml", ".npz"})])
-def test_more_than_fifty_states_are_in_an_archive(n, names):
+def test_more_than_fifty_states_are_in_an_archive(n, names, tmp_path):
     system = SimpleNamespace(A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n), D=[[0]], dt=0)
     files = from_control(system, "many", initial_state=[1] * n).files()
     assert {Path(name).suffix for name in files} == names
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    found = load_plant(tmp_path / "many.yaml").coefficients.taylor(np.zeros(1), 0)
+    for name in "ABC":
+        np.testing.assert_array_equal(getattr(found, name)[0, 0], getattr(system, name))
 
 
 LEAK = (
