@@ -484,6 +484,9 @@ def test_lion_takes_rows_in_turn_but_those_of_rounding(sizes, taken):
         ["p1", "p2", "p3"], 10.0, 5,
     )
     assert lion_rows(made).tolist() == taken
+    at, inside = T[:2], T[:2]
+    rows = estimators.build({"name": "lion"}).seen(made)(at, inside)
+    np.testing.assert_array_equal(rows @ made.psi(at), made.psi(at)[:, taken])
 
 
 def test_ls_drem_delta_is_the_reference_one():
@@ -1243,6 +1246,9 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
+    if units is None:  # ‖F‖ of F = (f₀ I + α G)⁻¹ in beside a bound of 4
+        forgetting = 0.3 * (1.0 - np.linalg.norm(expected, 2, axis=(1, 2)) / 2.0 / 4.0)
+        np.testing.assert_allclose(info.forgetting(2.0, 0.5, 0.3, 4.0), forgetting, rtol=1e-9)
 
 
 def test_a_gain_that_would_do_is_named_where_the_one_in_use_is_less():

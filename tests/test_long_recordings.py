@@ -324,6 +324,16 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     np.testing.assert_array_equal(mesh.edges[:-1][fresh], groups.starts)
 
 
+def test_after_each_start_samples_are_in_groups_as_after_the_first():
+    """They grow with the rows since it, and begin at the rows of the start and of those asked."""
+    rows, halves = Rows(np.linspace(0.0, 100.0, 20_001)), np.array([0.0, 50.0])
+    starts = grouped(rows, 100.0, np.array([25.0, 75.0]), halves, 20, 16).starts
+    first, second = np.split(starts, [np.searchsorted(starts, 50.0)])
+    assert {25.0, 50.0, 75.0} <= set(starts.tolist())
+    assert np.diff(first).max() > 10 * np.diff(first).min()
+    np.testing.assert_allclose(second[: len(first)] - 50.0, first, atol=1e-9)
+
+
 TANKS = {
     "name": "tanks", "states": ["h1", "h2", "q"], "inputs": {"u": "0.2 + 0.05*sin(t/200)"},
     "unknowns": {"leak": 4e-5, "gain": 9.3e-4}, "outputs": ["level"],
