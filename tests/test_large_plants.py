@@ -692,15 +692,23 @@ def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
         assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
 
 
-def test_a_full_plant_that_nothing_drives():
-    rng = np.random.default_rng(8)
+@pytest.mark.parametrize("driven", [False, True])
+def test_a_full_plant_that_nothing_drives_or_a_constant_and_an_input(driven):
+    """The latter in one equation each; with 1 and u = exp(-t) as states it is a free plant, too."""
+    rng, more = np.random.default_rng(8), {}
+    if driven:
+        more = {"inputs": {"u": "exp(-t)"}, "phi": np.eye(51)[3].tolist(),
+                "B": np.eye(51)[:, 7:8].tolist()}
     E, A = np.linalg.qr(rng.normal(size=(51, 51)))[0], rng.normal(size=(51, 51)) / 9.0
     system = load_plant({
         "name": "free", "states": [f"x{k}" for k in range(51)], "E": E.tolist(), "A": A.tolist(),
-        "initial_state": [1.0] * 51,
+        "initial_state": [1.0] * 51, **more,
     })
     found = large.large_simulation(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
-    end = expm(2.0 * E.T @ A) @ np.ones(51)
+    slope = np.zeros((53, 53))
+    slope[:51, :51], slope[52, 52] = E.T @ A, -1.0
+    slope[:51, 51:] = E.T[:, [3, 7]] * driven
+    end = (expm(2.0 * slope) @ np.ones(53))[:51]
     np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
 
 
