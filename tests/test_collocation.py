@@ -495,22 +495,25 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding
 
 
-@pytest.mark.parametrize(("start", "factor"), [(0.0, 2.0), (-1.0, 0.5)])
-def test_a_transient_beside_rounding_is_resolved(start, factor):
+@pytest.mark.parametrize(("start", "factor", "unit"), [
+    (0.0, 2.0, 1.0), (-1.0, 0.5, 1.0), (0.0, 2.0, 1e6), (0.0, 2.0, 1e-6),
+])
+def test_a_transient_beside_rounding_is_resolved(start, factor, unit):
     """Tails of 1e-5 differ at times beside, and one of 0.4 falls in elements below 1e-6 only."""
     seen = [np.zeros(0)]
 
     def evaluate(mesh, found, kept):
         moved = len(seen[-1]) == len(mesh.edges) and (seen[-1] != mesh.edges).any()
         seen.append(mesh.edges)
-        there = (mesh.edges[:-1] <= start + 0.3) & (mesh.edges[1:] > start + 0.3)
+        kink = (start + 0.3) * unit
+        there = (mesh.edges[:-1] <= kink) & (mesh.edges[1:] > kink)
         rounding = 1e-5 * (factor if moved else 1.0)
-        return found, np.where(there, 0.4 * (mesh.steps > 1e-6), rounding)
+        return found, np.where(there, 0.4 * (mesh.steps > 1e-6 * unit), rounding)
 
-    mesh = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8))
+    mesh = Mesh((start + np.linspace(0.0, 1.0, 25)) * unit, radau_rule(8))
     mesh, _, tail = refine(evaluate, mesh, tol=1e-9, max_elements=99_999, name="law")
     assert tail.max() <= 2e-5
-    assert mesh.steps.min() < 1e-6
+    assert mesh.steps.min() < 1e-6 * unit
     assert mesh.size < 24 * 8 * 8 + 100
 
 

@@ -475,6 +475,21 @@ def test_coefficients_that_swing_are_resolved_before_anything_is_solved(monkeypa
     assert (off <= found.state_errors * np.abs(true.values).max(axis=(0, 1))).all()
 
 
+def test_a_matrix_is_resolved_in_units_of_its_states():
+    mesh, places = Mesh(np.linspace(0.0, 4.0, 9), radau_rule(4)), np.array([0, 1, 0, 1])
+    entries = np.sin(mesh.points.reshape(-1, 1) * [1.0, 2.0, 3.0, 4.0])
+    plain, other = (
+        large._Plant.matrix_tail(None, mesh, SimpleNamespace(
+            d=2, units=units, matrix=SimpleNamespace(
+                entries=entries * (units[[0, 0, 1, 1]] / units[places]), columns=places,
+                rows=np.array([0, 2, 4]),
+            ),
+        )) for units in (np.ones(2), np.array([1e6, 1e-3]))
+    )
+    assert plain.min() > 0.0
+    np.testing.assert_allclose(other, plain, rtol=1e-9)
+
+
 def by_place(matrix, rows, columns):
     return {f"{rows[i]},{columns[j]}": float(matrix[i, j]) for i, j in zip(*np.nonzero(matrix),
                                                                            strict=True)}
