@@ -199,6 +199,16 @@ def test_what_cancels_now_and_moves_is_not_taken_for_nothing():
         added(-1.0, 5.0)
 
 
+def test_what_is_tiny_beside_another_state_is_not_solved_for():
+    """Though it is in fewer rows: of 1e-9 a + (2 - t) b = ... b is taken, which is 1 at least."""
+    row = {0: np.full((1, 2), 1e-9), 1: np.array([[2.0, 1.0]])}
+    equations = SimpleNamespace(
+        row=lambda _: row, where=lambda k: range(1 + k), units=np.ones(2), least=1.0
+    )
+    assert _Equations.pivot(equations, 0, [0, 1]) == 1
+    assert equations.least == 0.5
+
+
 def star(cells):
     """One algebraic state that is the sum of all others, and drives them."""
     E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)

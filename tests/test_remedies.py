@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,10 +32,11 @@ from gpebo_cli.evidence.excitation import window_level
 from gpebo_cli.experiment.assumptions import examine
 from gpebo_cli.experiment.pipeline import run_experiment
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.remedies import reset as resetting
 from gpebo_cli.observers.remedies.reset import _with_edges
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.regression import dynamics, linear
@@ -587,6 +589,24 @@ def test_filters_in_current_coordinates_hold_the_state():
     assert (np.abs(residual).max(axis=1) <= 1e-10 * size.max()).all()
     expected = (*system.unknowns, "w_x1", "w_x2", "w_x3")
     assert observation.parameters == expected
+
+
+def test_resets_are_at_the_last_edges_before_too_much_growth():
+    """Of x' = 4 t x, whose logarithm grows by 2 t²; the mesh is not the one that resolves it."""
+    edges, one = np.linspace(0.0, 6.0, 13), np.eye(1)
+    reduced = SimpleNamespace(
+        mesh=Mesh(edges, radau_rule(5)), units=np.ones(1), system=SimpleNamespace(name="p"),
+        matrices=lambda t, _: SimpleNamespace(dynamics=4.0 * t[:, None, None]),
+        solver=SolverSettings(), begin=SimpleNamespace(basis=one),
+        first=SimpleNamespace(split=SimpleNamespace(dual=one)),
+    )
+    expected, last = [], 0.0
+    for before, after in pairwise(edges.tolist()):
+        if 2.0 * (after**2 - last**2) > np.log(resetting._GROWTH):
+            last = before
+            expected.append(last)
+    assert len(expected) > 2
+    assert resetting.growth_times(reduced).tolist() == expected
 
 
 def test_a_gain_of_ones_own_moves_the_eigenvalues():
