@@ -592,20 +592,21 @@ def test_filters_in_current_coordinates_hold_the_state():
 
 
 def test_resets_are_at_the_last_edges_before_too_much_growth():
-    """Of x' = 4 t x, whose logarithm grows by 2 t²; the mesh is not the one that resolves it."""
+    """Of x' = (12 − 2 t) x, whose logarithm grows by 12 t − t², in the first element too much."""
     edges, one = np.linspace(0.0, 6.0, 13), np.eye(1)
     reduced = SimpleNamespace(
         mesh=Mesh(edges, radau_rule(5)), units=np.ones(1), system=SimpleNamespace(name="p"),
-        matrices=lambda t, _: SimpleNamespace(dynamics=4.0 * t[:, None, None]),
+        matrices=lambda t, _: SimpleNamespace(dynamics=12.0 - 2.0 * t[:, None, None]),
         solver=SolverSettings(), begin=SimpleNamespace(basis=one),
         first=SimpleNamespace(split=SimpleNamespace(dual=one)),
     )
     expected, last = [], 0.0
     for before, after in pairwise(edges.tolist()):
-        if 2.0 * (after**2 - last**2) > np.log(resetting._GROWTH):
+        if before > 0.0 and (12.0 - after - last) * (after - last) > np.log(resetting._GROWTH):
             last = before
             expected.append(last)
-    assert len(expected) > 2
+    assert expected[:2] == [0.5, 1.0]
+    assert np.ptp(np.diff(expected)) > 0.4
     assert resetting.growth_times(reduced).tolist() == expected
 
 
