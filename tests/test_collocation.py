@@ -494,22 +494,25 @@ def test_rounding_is_known_as_such_and_refused_where_it_leaves_too_little():
     assert len(sizes) > len(set(sizes))  # with the look at whether it is rounding
 
 
-@pytest.mark.parametrize(("start", "factor"), [(0.0, 2.0), (-1.0, 0.5)])
-def test_a_transient_beside_rounding_is_resolved(start, factor):
+@pytest.mark.parametrize(("start", "factor", "unit"), [
+    (0.0, 2.0, 1.0), (-1.0, 0.5, 1.0), (0.0, 2.0, 1e6), (0.0, 2.0, 1e-6),
+])
+def test_a_transient_beside_rounding_is_resolved(start, factor, unit):
     """Tails of 1e-5 differ at times beside, and one of 0.4 falls in elements below 1e-6 only."""
     seen = [np.zeros(0)]
 
     def evaluate(mesh, found, kept):
         moved = len(seen[-1]) == len(mesh.edges) and (seen[-1] != mesh.edges).any()
         seen.append(mesh.edges)
-        there = (mesh.edges[:-1] <= start + 0.3) & (mesh.edges[1:] > start + 0.3)
+        kink = (start + 0.3) * unit
+        there = (mesh.edges[:-1] <= kink) & (mesh.edges[1:] > kink)
         rounding = 1e-5 * (factor if moved else 1.0)
-        return found, np.where(there, 0.4 * (mesh.steps > 1e-6), rounding)
+        return found, np.where(there, 0.4 * (mesh.steps > 1e-6 * unit), rounding)
 
-    mesh = Mesh(start + np.linspace(0.0, 1.0, 25), radau_rule(8))
+    mesh = Mesh((start + np.linspace(0.0, 1.0, 25)) * unit, radau_rule(8))
     mesh, _, tail = refine(evaluate, mesh, tol=1e-9, max_elements=99_999, name="law")
     assert tail.max() <= 2e-5
-    assert mesh.steps.min() < 1e-6
+    assert mesh.steps.min() < 1e-6 * unit
     assert mesh.size < 24 * 8 * 8 + 100
 
 
@@ -696,16 +699,31 @@ def test_rounding_that_constraints_let_through_counts_up_to_what_is_seen_of_it()
     np.testing.assert_allclose(least_sizes(replace(problem, floor=0.1), own, 1e-6), 0.1)
 
 
+@pytest.mark.parametrize("power", [1, 2])
+@pytest.mark.parametrize("of_time", [False, True])
 @pytest.mark.parametrize("constant", [False, True])
-def test_rounding_in_one_element_counts_as_if_all_before_had_the_same(constant):
-    """In one of 99 elements that keep everything; up to a chance where its coefficients change."""
-    mesh, one = Mesh(np.arange(100.0), radau_rule(3)), np.ones((99, 1, 1))
+def test_rounding_in_one_element_counts_as_if_all_before_had_the_same(constant, of_time, power):
+    """In one of 99 elements that keep everything; up to a chance where its coefficients change.
+
+    Rounding of the time comes with that chance anyway.
+    """
+    mesh, one = Mesh(np.arange(100.0) ** power, radau_rule(3)), np.ones((99, 1, 1))
     noise = np.zeros((99, 1, 3))
-    noise[70, 0, 1], noise[:, 0, 0] = 1e-3, 1.0 if constant else np.arange(1.0, 100.0)
+    noise[70, 0, 2 if of_time else 1] = 1e-3
+    noise[:, 0, 0] = mesh.steps if constant else mesh.steps * np.arange(1.0, 100.0)
     problem = LinearProblem(None, np.zeros((1, 1)))
     found = estimated_errors(problem, mesh, one, 0 * one, noise, np.zeros((99, 4, 1, 1)))
     factor = 10.0 if constant else CHANCE
+    if constant and of_time:
+        factor *= CHANCE / np.sqrt(72.0)
     np.testing.assert_allclose(found.last, [[1e-3 * EPS * factor]], rtol=1e-9)
+
+
+@pytest.mark.parametrize("stages", [2, 3, 9])
+def test_each_of_the_last_coefficients_that_fall_by_a_factor_gives_the_next_one(stages):
+    powers = radau_rule(stages).to_next
+    last = 0.3 ** np.arange(stages + 1)[-len(powers) :]
+    np.testing.assert_allclose(last**powers, 0.3 ** (stages + 1), rtol=1e-12)
 
 
 def test_errors_of_the_start_are_carried_with_the_solution():

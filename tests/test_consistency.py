@@ -249,6 +249,9 @@ def test_no_piece_between_jumps_goes_unprobed():
     pieces = np.arange(int(20.0 * 150.0 / np.pi) + 1) * np.pi / 150.0
     probed = np.searchsorted(pieces, _probe_times(plant, 0.0, 20.0))
     assert np.unique(probed).tolist() == list(range(1, len(pieces) + 1))
+    late = _probe_times(plant, 7.0, 8.0)
+    assert 7.0 < late.min() < 7.01
+    assert 7.99 < late.max() < 8.0
 
 
 @pytest.mark.parametrize(("E", "A", "message"), [
@@ -404,7 +407,7 @@ def test_terms_of_equations_are_the_sizes_of_what_they_are_the_sum_of(seed):
     phi, t = rng.normal(size=3), np.linspace(0.5, 2.0, 6)
     system = plant_from_mapping({
         "name": "terms", "states": ["a", "b", "c"], "inputs": {"u": "1 + t", "v": "cos(t)"},
-        "E": np.diag([1, 2, 4]).tolist(), "A": [[f"({x})*t" for x in row] for row in A.tolist()],
+        "E": np.diag([1, -2, 4]).tolist(), "A": [[f"({x})*t" for x in row] for row in A.tolist()],
         "B": B.tolist(), "F": F.tolist(), "unknowns": {"w": -3.0}, "phi": phi.tolist(),
         "initial_state": [0, 0, 0],
     })

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from gpebo_cli.evidence.knowledge import knowledge
 from gpebo_cli.experiment import doubts
+from gpebo_cli.experiment.online import OnlineEstimates
 from gpebo_cli.findings import Requirement
 
 RNG = np.random.default_rng(7)
@@ -149,6 +151,32 @@ def test_what_is_unfinished_has_no_deviations():
     assert why == ""
     none = doubts.finished(std, ROOT, final, required(False), columns[:0])
     assert (none[0] is std, none[1]) == (True, "")
+
+
+def test_deviations_at_samples_are_those_of_each_case_that_has_some():
+    """Of four cases the second one is not done at the end, and the last one did not move at all."""
+    std, by_noise = np.full((4, 3, 5), 0.1), np.ones((4, 3), dtype=bool)
+    by_noise[1:, 2], by_noise[2, 2], by_noise[3, 1] = False, True, False
+    made = OnlineEstimates(*[None] * 8, std, np.array([9.0, 9.0, 2.0]), GAIN, by_noise)
+    kept, told = np.array([0, 2]), np.ones((4, 2, 5), dtype=bool)
+    told[2, 0, 3:] = False
+
+    def at(*cases):
+        some = replace(made, std=std[[*cases]], by_noise=by_noise[[*cases]])
+        still = np.array([case == 3 for case in cases])
+        return some.at(kept, told[[*cases]], still)
+
+    found, gain, why = at(0, 1, 2, 3)
+    expected = np.full((4, 2, 5), 0.2)
+    expected[1, 1], expected[2, 0, 3:], expected[3] = np.nan, np.nan, np.nan
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(gain, np.stack([GAIN[kept]] * 4))
+    assert why == doubts.UNFINISHED
+    assert at(0, 3)[2] == at(3)[2] == ""  # that it stands still is said elsewhere
+    assert np.isnan(at(3)[0]).all()
+    kept, told = kept[1:], told[:, 1:]
+    found, _, why = at(1, 3)
+    assert (found, why) == (None, doubts.UNFINISHED)
 
 
 def test_estimates_moved_by_noise_are_near_least_squares_until_the_requirement_is_met():

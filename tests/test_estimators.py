@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
 from gpebo_cli.estimators._scalar import (
+    _element_maps,
     kreisselmeier,
     lion,
     lion_rows,
@@ -34,7 +36,7 @@ from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.findings import would_do
-from gpebo_cli.numerics.mesh import initial_mesh
+from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.plain_yaml import parse
 from gpebo_cli.regression.dynamics import Dynamics
@@ -484,6 +486,9 @@ def test_lion_takes_rows_in_turn_but_those_of_rounding(sizes, taken):
         ["p1", "p2", "p3"], 10.0, 5,
     )
     assert lion_rows(made).tolist() == taken
+    at, inside = T[:2], T[:2]
+    rows = estimators.build({"name": "lion"}).seen(made)(at, inside)
+    np.testing.assert_array_equal(rows @ made.psi(at), made.psi(at)[:, taken])
 
 
 def test_ls_drem_delta_is_the_reference_one():
@@ -1243,6 +1248,25 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
+    if units is None:  # ‖F‖ of F = (f₀ I + α G)⁻¹ in beside a bound of 4
+        forgetting = 0.3 * (1.0 - np.linalg.norm(expected, 2, axis=(1, 2)) / 2.0 / 4.0)
+        np.testing.assert_allclose(info.forgetting(2.0, 0.5, 0.3, 4.0), forgetting, rtol=1e-9)
+
+
+def test_how_wrong_a_mixed_law_is_does_not_depend_on_units_of_the_regression():
+    mesh, found = Mesh(np.linspace(0.0, 1.0, 4), radau_rule(4)), []
+    for unit in (1.0, 1e6):
+        def signals(t, _, unit=unit):
+            delta = unit * (2.0 + np.sin(t))
+            return delta, delta[:, None] * [3.0, -5.0], np.full(len(t), 1e-3)
+
+        gains = np.array([[2.0], [7.0]]) / unit**2
+        path = SimpleNamespace(signals=signals, pace=None)
+        found.append(_element_maps(path, mesh, np.ones((3, 2)), gains))
+    (maps, errors), (other_maps, other_errors) = found
+    assert errors.min() > 0.0
+    np.testing.assert_allclose(other_maps, maps, rtol=1e-9)
+    np.testing.assert_allclose(other_errors, errors, rtol=1e-9)
 
 
 def test_a_gain_that_would_do_is_named_where_the_one_in_use_is_less():

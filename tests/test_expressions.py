@@ -214,6 +214,8 @@ def test_min_and_max_are_one_of_the_two_to_the_last_bit() -> None:
         ("pi/2", math.pi / 2), ("sin(pi/6)", 0.5), ("2*(1 + 3)/4 - 1", 1.0), (" 1\n + 2 ", 3.0),
         ("d(7)", 0.0), ("d(2*t + 1)", 2.0), ("d(d(t))", 0.0), ("t - t + 3", 3.0), ("0*t", 0.0),
         ("min(2, 3)", 2.0), ("max(2, 3)", 3.0), ("max(t, t + 2) - t", 2.0),
+        *((f"{name}(t + {a}, t) - t", want) for a in (0.5, -0.5) for name, want in
+          (("min", min(a, 0.0)), ("max", max(a, 0.0)))),
         ("atan(1)", math.pi / 4),
         ("abs(-2)", 2.0), ("sign(-3)", -1.0), ("sign(0)", 0.0), ("log(exp(2))", 2.0),
         ("t**0", 1.0), ("0**0", 1.0), ("a*2", 6.0), ("sqrt(16)", 4.0), (Fraction(1, 4), 0.25),

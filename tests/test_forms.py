@@ -23,7 +23,7 @@ from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import AffineStateMap, Measurements, gpebo, observe
-from gpebo_cli.observers.reduced.matrices import observer_matrices
+from gpebo_cli.observers.reduced.matrices import _eliminate_in_part, observer_matrices
 from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives, strangeness_free
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -1009,3 +1009,21 @@ def test_a_state_that_is_zero_because_terms_cancel_is_no_signal():
     )
     assert np.abs(found.errors["x3"]).max() < 1e-12
     assert np.abs(found.errors["x1"][0, -1]) < 1e-6
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_a_rank_in_part_is_relative_to_the_size_of_the_equations(unit):
+    """Two of three columns are one: what is told of the others is the same in any unit."""
+    columns, kernel = np.random.default_rng(0).normal(size=(3, 4, 3)), np.eye(5, 3)[None]
+    columns[:, :, 2] = columns[:, :, 0]
+    (of_plain, inverse, least), (of_other, other, also) = (
+        _eliminate_in_part(
+            SimpleNamespace(name="p"), by * columns, kernel, np.full(3, 2.0 * by), np.arange(3.0),
+            1e-10, np.ones(5), 2,
+        ) for by in (1.0, unit)
+    )
+    np.testing.assert_allclose(of_other @ transpose(of_other), of_plain @ transpose(of_plain),
+                               atol=1e-12)
+    np.testing.assert_allclose(other @ transpose(of_other) * unit, inverse @ transpose(of_plain),
+                               atol=1e-9)
+    np.testing.assert_allclose(also, least, rtol=1e-9)

@@ -134,6 +134,8 @@ def test_a_function_that_is_not_analytic_is_refused_where_it_matters():
         ({"A": lambda t: circuit_A(t)[:, :5]}, r"A returned shape \(3, 5, 6\)"),
         ({"A": lambda t: circuit_A(t) / 0.0}, "A is not finite at t = 1$"),
         ({"A": lambda t: circuit_A(t) / (t < 2)[:, None, None]}, "A is not finite at t = 2$"),
+        ({"A": lambda t: circuit_A(t) / np.where(np.eye(6), (t < 2)[:, None, None], 1)},
+         "A is not finite at t = 2$"),
     ],
 )
 def test_what_does_not_fit_is_named(changes, message):

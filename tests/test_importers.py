@@ -333,10 +333,10 @@ def test_a_circuit_starts_from_what_is_said_of_it():
     """Voltages along chains of capacitors, and what currents follow from them."""
     text = (
         "t\nC1 a 0 1 ic=3\nC2 a b 1 ic=1\nR1 a b {2+time}\nL1 b c 1 ic=0.5\nL2 c 0 1\nR2 c 0 1\n"
-        "R3 0 a 2\n.ic i(L2)=0.25\n.save i(R1) i(R3)\n"
+        "R3 0 a 2\n.ic i(L2)=0.25 i(R2)=0.125\n.save i(R1) i(R3)\n"
     )
     assert plant_of(text)["initial_state"] == {
-        "a": 3, "b": 2, "c": 0, "ir1": 0.5, "ir3": -1.5, "il1": 0.5, "il2": 0.25
+        "a": 3, "b": 2, "c": 0, "ir1": 0.5, "ir2": 0.125, "ir3": -1.5, "il1": 0.5, "il2": 0.25
     }
 
 
@@ -723,10 +723,15 @@ def test_a_state_space_model():
 
 
 @pytest.mark.parametrize(("n", "names"), [(50, {".yaml"}), (51, {".yaml", ".npz"})])
-def test_more_than_fifty_states_are_in_an_archive(n, names):
+def test_more_than_fifty_states_are_in_an_archive(n, names, tmp_path):
     system = SimpleNamespace(A=-np.eye(n), B=np.ones((n, 1)), C=np.eye(1, n), D=[[0]], dt=0)
     files = from_control(system, "many", initial_state=[1] * n).files()
     assert {Path(name).suffix for name in files} == names
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    found = load_plant(tmp_path / "many.yaml").coefficients.taylor(np.zeros(1), 0)
+    for name in "ABC":
+        np.testing.assert_array_equal(getattr(found, name)[0, 0], getattr(system, name))
 
 
 LEAK = (

@@ -299,7 +299,7 @@ CASES: list[tuple[str, str, Case]] = [
     ("elements", "chain", partial(_maps, k=1, n=16, c=9)),
     *(("elements", "carried_errors", partial(_carried, **options)) for options in (
         {}, {"k": 2}, {"k": 9, "constant": True}, {"k": 1, "s": 2, "n": 1, "c": 1},
-        {"s": 14, "n": 5}, {"still": True}, {"unit": 1e-6},
+        {"s": 14, "n": 5}, {"still": True}, {"unit": 1e-6}, {"unit": 4e307},
     )),
     *(("elements", "series", partial(_series, **options)) for options in (
         {}, {"constant": True, "forced": 0}, {"s": 14, "c": 13, "kicked": False},

@@ -199,6 +199,16 @@ def test_what_cancels_now_and_moves_is_not_taken_for_nothing():
         added(-1.0, 5.0)
 
 
+def test_what_is_tiny_beside_another_state_is_not_solved_for():
+    """Though it is in fewer rows: of 1e-9 a + (2 - t) b = ... b is taken, which is 1 at least."""
+    row = {0: np.full((1, 2), 1e-9), 1: np.array([[2.0, 1.0]])}
+    equations = SimpleNamespace(
+        row=lambda _: row, where=lambda k: range(1 + k), units=np.ones(2), least=1.0
+    )
+    assert _Equations.pivot(equations, 0, [0, 1]) == 1
+    assert equations.least == 0.5
+
+
 def star(cells):
     """One algebraic state that is the sum of all others, and drives them."""
     E, A, C = np.eye(cells + 1), -np.eye(cells + 1), np.eye(2, cells + 1)
@@ -475,6 +485,21 @@ def test_coefficients_that_swing_are_resolved_before_anything_is_solved(monkeypa
     assert (off <= found.state_errors * np.abs(true.values).max(axis=(0, 1))).all()
 
 
+def test_a_matrix_is_resolved_in_units_of_its_states():
+    mesh, places = Mesh(np.linspace(0.0, 4.0, 9), radau_rule(4)), np.array([0, 1, 0, 1])
+    entries = np.sin(mesh.points.reshape(-1, 1) * [1.0, 2.0, 3.0, 4.0])
+    plain, other = (
+        large._Plant.matrix_tail(None, mesh, SimpleNamespace(
+            d=2, units=units, matrix=SimpleNamespace(
+                entries=entries * (units[[0, 0, 1, 1]] / units[places]), columns=places,
+                rows=np.array([0, 2, 4]),
+            ),
+        )) for units in (np.ones(2), np.array([1e6, 1e-3]))
+    )
+    assert plain.min() > 0.0
+    np.testing.assert_allclose(other, plain, rtol=1e-9)
+
+
 def by_place(matrix, rows, columns):
     return {f"{rows[i]},{columns[j]}": float(matrix[i, j]) for i, j in zip(*np.nonzero(matrix),
                                                                            strict=True)}
@@ -692,15 +717,23 @@ def test_states_and_what_is_integrated_of_them_belong_together(build, varying):
         assert (form.known <= 15.0 * np.maximum(np.abs(known).max(axis=0), 0.1)).all()
 
 
-def test_a_full_plant_that_nothing_drives():
-    rng = np.random.default_rng(8)
+@pytest.mark.parametrize("driven", [False, True])
+def test_a_full_plant_that_nothing_drives_or_a_constant_and_an_input(driven):
+    """The latter in one equation each; with 1 and u = exp(-t) as states it is a free plant, too."""
+    rng, more = np.random.default_rng(8), {}
+    if driven:
+        more = {"inputs": {"u": "exp(-t)"}, "phi": np.eye(51)[3].tolist(),
+                "B": np.eye(51)[:, 7:8].tolist()}
     E, A = np.linalg.qr(rng.normal(size=(51, 51)))[0], rng.normal(size=(51, 51)) / 9.0
     system = load_plant({
         "name": "free", "states": [f"x{k}" for k in range(51)], "E": E.tolist(), "A": A.tolist(),
-        "initial_state": [1.0] * 51,
+        "initial_state": [1.0] * 51, **more,
     })
     found = large.large_simulation(system, TimeSettings(horizon=2.0), SolverSettings(tol=1e-9))
-    end = expm(2.0 * E.T @ A) @ np.ones(51)
+    slope = np.zeros((53, 53))
+    slope[:51, :51], slope[52, 52] = E.T @ A, -1.0
+    slope[:51, 51:] = E.T[:, [3, 7]] * driven
+    end = (expm(2.0 * slope) @ np.ones(53))[:51]
     np.testing.assert_allclose(found.signals.states.final, end, atol=1e-9)
 
 

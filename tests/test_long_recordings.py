@@ -217,6 +217,20 @@ def test_windows_together_have_the_largest_errors_and_sizes_of_each():
         assert values.reshape(3, -1).min(axis=1).tolist() == [1.0, 2.0, 0.5]
 
 
+@pytest.mark.parametrize(("eliminated", "shown"), [(0, 1), (1, 2), (2, 3)])
+def test_a_state_that_is_a_coordinate_is_resolved_as_that_or_by_its_gain(eliminated, shown):
+    """Of three states two are coordinates; ``shown`` of them have gains, as they are eliminated."""
+    rng, shapes = np.random.default_rng(0), ((1,), (1, 2), (3,), (3, 2))
+    found = Assembled(
+        *(rng.normal(size=(9, *shape)) for shape in shapes), 1.0, np.ones(2),
+        np.arange(3) < eliminated, np.ones((2, 3)), np.ones((3, 2)),
+    )
+    kinds = list(found.kinds(np.ones(3), np.eye(3, 2)))
+    of_z = [floor.shape for signal, floor in kinds if signal is None]
+    assert of_z == ([(2, 2)] if eliminated < 2 else [])
+    assert kinds[3][0].shape == (9, shown, 2)
+
+
 @pytest.mark.parametrize(("observer", "estimator"), [
     ("kalman_bucy", "ls_drem"),
     *(({"name": "gpebo", "remedy": "current_coordinates"}, e) for e in (
@@ -322,6 +336,16 @@ def test_a_bend_at_a_sample_within_a_group_is_no_edge():
     np.testing.assert_array_equal(mesh.edges[late], expected[expected > 4.0])
     assert mesh.size < 1500
     np.testing.assert_array_equal(mesh.edges[:-1][fresh], groups.starts)
+
+
+def test_after_each_start_samples_are_in_groups_as_after_the_first():
+    """They grow with the rows since it, and begin at the rows of the start and of those asked."""
+    rows, halves = Rows(np.linspace(0.0, 100.0, 20_001)), np.array([0.0, 50.0])
+    starts = grouped(rows, 100.0, np.array([25.0, 75.0]), halves, 20, 16).starts
+    first, second = np.split(starts, [np.searchsorted(starts, 50.0)])
+    assert {25.0, 50.0, 75.0} <= set(starts.tolist())
+    assert np.diff(first).max() > 10 * np.diff(first).min()
+    np.testing.assert_allclose(second[: len(first)] - 50.0, first, atol=1e-9)
 
 
 TANKS = {

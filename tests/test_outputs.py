@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -341,6 +342,7 @@ def test_plain_reduces_numpy_and_containers() -> None:
     }
     assert strict(value) == {"a": None, "b": [3, True], "c": [1.0, None]}
     assert strict(Path("x")) == "x"
+    assert strict({"of others": [Fraction(1, 3)]}) == {"of others": ["1/3"]}
 
 
 def test_summary_keeps_the_order_of_its_keys() -> None:

@@ -129,6 +129,8 @@ def test_deviations_of_the_unknowns_follow_from_those_of_the_parameters():
     ({"box": {**TEXT["box"], "c": [0, 1]}}, "box.c is not an unknown (a, b)"),
     *(({"box": {**TEXT["box"], "a": ends}}, "box.a must be [low, high] with low < high")
       for ends in ([2, 1], [2, 2])),
+    *(({"box": {**TEXT["box"], "a": ends}}, f"box.a must be [low, high], not {ends}")
+      for ends in ([0], [0, 1, 2], 3)),
     ({"S": None}, "box is for S"),
     ({"S": ["a", "b", "a*c", "1"]}, "S[2]"),
     ({"psi": [["u", "1"]]}, "an entry for each of the 4 unknowns (eta_1, eta_2, eta_3, eta_4)"),

@@ -292,6 +292,12 @@ def test_elements_end_where_one_of_the_signals_bends():
     assert read.rows.hold == "cubic"
 
 
+@pytest.mark.parametrize(("hold", "sample"), [("zoh", 3), ("linear", 2)])
+def test_a_sample_bends_where_one_of_the_columns_does(hold, sample):
+    values = np.array([[7.0, 0.0], [7.0, 0.0], [7.0, 0.0], [7.0, 1.0]])
+    assert bends(np.arange(4.0), values, hold).nonzero()[0].tolist() == [sample]
+
+
 def test_a_cut_next_to_a_sample_is_that_sample():
     t = np.array([0.0, 1.0, 2.0])
     assert edges(t, np.array([1.0 + 1e-12, 1.5])).tolist() == [0.0, 1.0, 1.5, 2.0]
@@ -643,6 +649,7 @@ def test_what_is_neither_files_nor_a_frame_is_one_line(data):
         ({"hold": {"v": "zoh"}}, "data.hold.v: plant circuit has no such signal; those are V, y"),
         ({"separator": "ab"}, "data.separator"),
         ({"separator": ".", }, "data.separator"),
+        *(({"separator": mark}, "data.separator: expected one character") for mark in '"\r\n'),
         ({"file": ["a.csv", "b.csv"]}, "data.file: here one file is needed, not several"),
     ],
 )

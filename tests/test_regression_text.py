@@ -66,6 +66,15 @@ def test_a_column_is_as_well_resolved_in_a_small_unit_as_in_another():
     np.testing.assert_allclose(other.psi.values, plain.psi.values * [1e-9, 1.0], rtol=1e-12)
 
 
+def test_signs_do_not_change_what_is_resolved():
+    """Of ψᵀY what is left where rows cancel is measured by the size of Y, even if that is < 0."""
+    plain, other = (
+        on_mesh({"unknowns": {"a": 1.0}, "signals": {"u": "t"}, "Y": [sign, sign],
+                 "psi": [["sin(u)"], ["-sin(u) + 1e-12*sin(31*u)"]]}) for sign in (1.0, -1.0)
+    )
+    np.testing.assert_array_equal(other.mesh.edges, plain.mesh.edges)
+
+
 def test_equal_operators_are_one():
     texts = ["lp(u*u, 2)", "lp(u*v, 2)", "lp(u*u, 2) + lp(lp(u*u, 2), 2)", "hp(u*v, 2)"]
     found = regression_from_mapping({

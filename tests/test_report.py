@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import os
 import re
 import shutil
@@ -23,7 +24,7 @@ from gpebo_cli import run
 from gpebo_cli.cli import compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import Fit, NoiseStatistics
-from gpebo_cli.results import document, html
+from gpebo_cli.results import comparison, document, html
 from gpebo_cli.results.comparison import figures
 from gpebo_cli.results.finished import find
 from gpebo_cli.results.folder import write_run
@@ -381,6 +382,18 @@ def test_figures_of_plants_in_subfolders_are_files_of_their_own(inside):
     assert names == [
         "errors_published_akzo_1", "errors_published_akzo_2", "errors_published_hires"
     ]
+
+
+@pytest.mark.parametrize(("values", "drawn"), [
+    ([1.0, 2.0, 3.0], ["over_x"]), ([0.0, 1.0, 2.0], []), ([1.0, 2.0, 3.0, math.inf], []),
+    (["a", "b", "c"], []),
+])
+def test_axes_are_of_positive_numbers(inside, monkeypatch, values, drawn):
+    """They are logarithmic."""
+    monkeypatch.setattr(comparison, "compose", lambda panels: panels)
+    case = find("circuit")[0].cases[0]
+    cases = [replace(case, chosen={**case.chosen, "x": x}) for x in values]
+    assert [name for name, _ in figures(cases)] == ["errors", *drawn]
 
 
 @pytest.mark.parametrize(

@@ -251,6 +251,24 @@ def test_it_does_not_matter_how_samples_are_grouped():
         assert parts.assumptions == at_once.assumptions
 
 
+@pytest.mark.parametrize("power", [0.0, 6.0])
+def test_the_extension_has_the_coordinates_that_an_E_without_turns_leaves(power):
+    """Of E = [e 0 0; 0 g 0; 0 0 0] two of three, whatever the units of the equations are."""
+    rows = 10.0 ** (power * np.array([1.0, -1.0, 1.0]))
+    E = np.diag([1.0, 1.0, 0.0])
+    A = np.array([[-1.0, 1.0, 1.0], [0.0, -2.0, 1.0], [1.0, 0.0, -1.0]])
+    system = plant_from_mapping({
+        "name": "fixed", "states": ["a", "b", "c"], "inputs": {"u": "cos(t)"}, "outputs": ["y"],
+        "E": [[f"{x!r}*(2 + sin(t))" for x in row] for row in (rows[:, None] * E).tolist()],
+        "A": (rows[:, None] * A).tolist(), "B": (rows[:, None] * [[1.0], [0.0], [1.0]]).tolist(),
+        "C": [[1, 0, 1]], "initial_state": [1, 1, 2],
+    })
+    t = np.linspace(0.0, 0.5, 6)
+    u, y = signals(system, t)
+    online = online_of(Settings({"name": "ls_drem"}), system, "zoh", t[0], np.append(u[0], y[0]))
+    assert online.feed(t, u, y).extension.shape[1] == 2
+
+
 def test_sizes_of_terms_have_no_sign_where_a_kernel_turns():
     plant = {**ROTATING, "initial_state": dict(zip(
         ROTATING["states"], ROTATING["initial_state"], strict=True))}

@@ -313,6 +313,21 @@ def test_a_result_of_other_overrides_is_a_missing_job(tmp_path):
     assert read_record(tmp_path, 0, {"a": "2"}).status == "missing"
 
 
+def test_what_a_job_left_is_no_result_of_its_next_attempt(tmp_path):
+    records = [JobRecord(k, {"a": "1"}, "done", 0.5, "", [{"gamma": 1.0}]) for k in (0, 1)]
+    for record in records:
+        folder = tmp_path / str(record.job)
+        folder.mkdir()
+        write_record(folder, record)
+        for name in (".half.tmp", "kept.csv"):
+            (folder / name).touch()
+    (tmp_path / ".stop").touch()
+    sweep_folder.clear(tmp_path, [1])
+    assert [read_record(tmp_path, k, {"a": "1"}).status for k in (0, 1)] == ["done", "missing"]
+    assert [path.name for path in (tmp_path / "1").iterdir()] == ["kept.csv"]
+    assert not (tmp_path / ".stop").exists()
+
+
 def test_a_plan_is_read_back(tmp_path):
     plan = Plan(({"a": "[1,2]", "b": "'ü'"}, {}), "0123")
     assert read_plan(tmp_path) is None

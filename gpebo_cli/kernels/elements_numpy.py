@@ -132,7 +132,7 @@ def carried_errors(
     K, points, n, columns = values.shape
     S = signs.shape[2] // 2
     with np.errstate(over="ignore", invalid="ignore"):
-        turned = np.ascontiguousarray(np.swapaxes(values, 0, 1)).reshape(points, -1)
+        turned = np.swapaxes(values, 0, 1).reshape(points, -1)
         most = np.zeros((5, K, n, columns))
         carried, tail, sizes, visible, made_of = most
         np.abs(turned).max(axis=0, out=sizes.ravel())

@@ -160,7 +160,7 @@ def _merged(signal: Held, knots: Array, rule: RadauRule, tol: float) -> Array:
     count = len(knots) - 1
     wanted = np.ones(count + 1, dtype=bool)
     done = np.zeros(count, dtype=bool)  # samples whose block is decided
-    level = max(0, int(np.log2(max(count // _FIRST_ELEMENTS, 1))))
+    level = int(np.log2(max(count // _FIRST_ELEMENTS, 1)))
     for length in 2 ** np.arange(level, 0, -1):
         first = np.arange(0, count - length + 1, length)
         first = first[~done[first]]
