@@ -1066,6 +1066,21 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
+@pytest.mark.parametrize("known", [("a", "b"), ("a",)])
+def test_states_of_several_files_are_known_where_each_file_has_them(tmp_path, known):
+    """x = start e^-t; where two files meet the second one's first row counts."""
+    t, files = np.linspace(0.0, 2.0, 21), []
+    for name, start in (("a", 1.0), ("b", -3.0)):
+        x = start * np.exp(-t)
+        columns = {"t": t, "y": x, **({"x": x} if name in known else {})}
+        files.append(write_table(tmp_path / f"{name}.csv", columns))
+    result = run(one_state(), data={"file": files, "hold": "cubic"}, time={"samples": 21})
+    first, second = np.exp(-t[:-1]), -3.0 * np.exp(-t)
+    expected = np.append(first, second if "b" in known else np.full(21, np.nan))
+    np.testing.assert_allclose(result.states["x"], expected, rtol=1e-9)
+    assert result.details.recording.known_states == (("x",) if "b" in known else ())
+
+
 def test_outputs_count_alike_in_all_files(tmp_path):
     """What acts from the first on the second state grows a thousandfold until the second file."""
     plant = one_state(
