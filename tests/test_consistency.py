@@ -360,19 +360,21 @@ def test_scales_of_full_matrices_make_largest_entries_one(seed, n):
     assert abs(np.log2(beside)) < 1.5
 
 
-@pytest.mark.parametrize(("usual", "rounding"), [(1.0, False), (1e-12, True)])
-def test_why_a_rank_is_unclear_at_one_time(usual, rounding):
-    """The constraint is what 1e-12 of large terms leaves: just there, or it is so at all times."""
+@pytest.mark.parametrize(("usual", "where", "rounding", "sudden"), [
+    (1.0, [3], False, True), (1e-12, [3], True, True), (1.0, [1, 3, 4], True, False),
+])
+def test_why_a_rank_is_unclear_at_some_times(usual, where, rounding, sudden):
+    """The constraint is what 1e-12 of large terms leaves: just there, or at most or all times."""
     turned = np.array([[0.8, -0.6], [0.6, 0.8]])
     row = np.tile([usual, usual], (5, 1))
-    row[3] = 1e-12, 1e-15
+    row[where] = 1e-12, 1e-15
     A = turned @ np.stack([np.ones((5, 2)), row], axis=1)
     model = np.zeros((2, 2, 5, 2, 2))
     model[0, 0], model[1, 0] = turned @ np.diag([1.0, 0.0]), A
     with pytest.raises(UnclearError) as unclear:
         in_stages(*model, np.zeros((2, 5, 2, 0)), 1e-10, 1)
     assert (unclear.value.place, unclear.value.rounding, unclear.value.sudden) == (
-        3, rounding, True)
+        where[0], rounding, sudden)
 
 
 @pytest.mark.parametrize(("singular", "value"), [((2.0, 2e-3, 0.0), "1.0e-03"),

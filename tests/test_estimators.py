@@ -33,6 +33,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
+from gpebo_cli.estimators.power import _resolved
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.findings import would_do
@@ -1097,6 +1098,21 @@ def test_a_stream_says_which_estimates_are_far_from_least_squares():
         assert known.t_c == pytest.approx(whole.t_c, abs=2.0 * signals.t[1])
         assert known.level == pytest.approx(whole.level, rel=1e-3)
         assert ", parameters well determined at the end; |Y − ψη̂| with the final" in said
+
+
+@pytest.mark.parametrize(("delta", "digits", "error", "good"), [
+    (1.0, 1.0, 2e-12, True), (1.0, 1.0, 1e-9, False), (1.0, 1e-7, 1e-9, True),
+    (1.0, 1e-7, 1e-5, False), (0.0, 1e-7, 1e-9, False), (1.0, 0.0, 1e-9, False),
+])
+def test_a_step_of_the_power_law_is_resolved_to_its_digits(delta, digits, error, good):
+    """By the last Legendre coefficient and the last change; what is not known needs no digits."""
+    mesh = initial_mesh(0.0, 1.0, [], 1, radau_rule(5))
+    path = SimpleNamespace(mesh=mesh, quotient=np.full((1, 6, 1), -100.0), floor=1.0)
+    wave = np.polynomial.legendre.Legendre.basis(5)(2.0 * mesh.rule.points - 1.0)
+    values = 3.0 + 100.0 * np.array([error, 0.0, 0.0])[:, None] * wave  # sizes are those of η̄
+    change, nodes = np.array([0.0, error, 0.0]), np.ones((3, 5))
+    found = _resolved(path, values, change, delta * nodes, digits * nodes)
+    np.testing.assert_array_equal(found, [good, good, True])
 
 
 def test_a_power_law_that_no_step_resolves_ends_in_one_line():

@@ -127,6 +127,10 @@ def test_unknowns_in_a_noisy_output_are_linearised_with_it():
         system, Measurements(noisy.inputs, noisy.outputs), remedy="noise_free"
     )
     eta = observation.regression.least_squares()
+    other = observe(  # what the plant says of its unknowns plays no part
+        plant(-1.0, 4.0, 0.3), Measurements(noisy.inputs, noisy.outputs), remedy="noise_free"
+    )
+    np.testing.assert_allclose(other.regression.least_squares(), eta, rtol=1e-9)
     x0 = -eta[2]
     t = np.linspace(0.0, 4.0, 4001)
     measured = noisy.outputs(t, np.minimum(t + 1e-9, 4.0))

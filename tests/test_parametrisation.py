@@ -316,6 +316,16 @@ def test_seeds_say_how_well_the_unknowns_are_estimated(estimator):
     np.testing.assert_allclose(found.deviation[:, -2:], single.std(axis=0, ddof=1).T, atol=1e-8)
 
 
+def test_at_samples_estimates_are_compared_with_what_least_squares_makes_of_them():
+    """Of exact data that is the truth, for η and for what S is made of."""
+    found = run(regression=TEXT, estimator={"name": "gradient", "gamma": 1e-3},
+                observer={"sample_time": 0.1}, time={"horizon": 6})
+    doubts, _ = found.details.estimation.doubts
+    for name, true in {"a": 2.0, "b": 0.5, "eta_3": 1.0}.items():
+        off = 1.0 - found.estimates[name][0, -1] / true
+        assert doubts[name] == pytest.approx(off, rel=1e-6), name
+
+
 def test_the_monotone_gradient_is_for_parametrisations():
     with pytest.raises(ConfigError, match="is for a regression with S and box"):
         run("circuit", estimator="monotone", time={"horizon": 1})

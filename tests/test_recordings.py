@@ -1093,17 +1093,41 @@ def test_several_files_share_unknowns_and_have_starts_of_their_own(tmp_path):
     )
 
 
-def test_outputs_count_alike_in_all_files(tmp_path):
-    """What acts from the first on the second state grows a thousandfold until the second file."""
+@pytest.mark.parametrize("known", [("a", "b"), ("a",)])
+def test_states_of_several_files_are_known_where_each_file_has_them(tmp_path, known):
+    """x = start e^-t; where two files meet the second one's first row counts."""
+    t, files = np.linspace(0.0, 2.0, 21), []
+    for name, start in (("a", 1.0), ("b", -3.0)):
+        x = start * np.exp(-t)
+        columns = {"t": t, "y": x, **({"x": x} if name in known else {})}
+        files.append(write_table(tmp_path / f"{name}.csv", columns))
+    result = run(one_state(), data={"file": files, "hold": "cubic"}, time={"samples": 21})
+    first, second = np.exp(-t[:-1]), -3.0 * np.exp(-t)
+    expected = np.append(first, second if "b" in known else np.full(21, np.nan))
+    np.testing.assert_allclose(result.states["x"], expected, rtol=1e-9)
+    assert result.details.recording.known_states == (("x",) if "b" in known else ())
+
+
+@pytest.mark.parametrize(("grows", "remedy"), [
+    ("0.001 + t", "none"), ("0.001 + 1e3*(1 - y)**2", "none"),
+    ("0.001 + 1e3*(1 - y)**2", "noise_free"),
+])
+def test_outputs_count_alike_in_all_files(tmp_path, grows, remedy):
+    """What acts from the first on the second state grows a thousandfold until the second file.
+
+    Along a copy without noise that is known for the plant itself.
+    """
     plant = one_state(
         states=["a", "b"], inputs={"u": 0}, outputs=["y", "z"], E=np.eye(2).tolist(),
-        A=[[-1, 0], ["0.001 + t", -1]], B=[[1], [0]], C=np.eye(2).tolist(), initial_state=[0, 0],
+        A=[[-1, 0], [grows, -1]], B=[[1], [0]], C=np.eye(2).tolist(), initial_state=[0, 0],
     )
     t = np.linspace(0.0, 1.0, 6)
     files = [str(tmp_path / f"{name}.csv") for name in "ab"]
     for file, start in zip(files, (0.0, 3.0), strict=True):
-        write_table(file, {"t": start + t, "u": t, "y": np.cos(t), "z": np.sin(t)})
-    psi = run(plant, data=files, time={"samples": 3}).details.regression.psi
+        y = np.cos(t) / (1.0 + start)
+        write_table(file, {"t": start + t, "u": t, "y": y, "z": np.sin(t)})
+    observer = {"name": "gpebo", "remedy": remedy}
+    psi = run(plant, data=files, observer=observer, time={"samples": 3}).details.regression.psi
     np.testing.assert_array_equal(psi[2, :, 2:], psi[0, :, :2])
 
 

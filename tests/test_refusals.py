@@ -151,7 +151,8 @@ def test_of_several_recordings_with_an_observer_of_later_states(tmp_path):
     for file in files:
         ROWS.to_csv(file, index=False)
     observer = {"name": "gpebo", "remedy": "reset", "reset_interval": 1.0}
-    with pytest.raises(ConfigError, match="several files need an observer whose parameters are θ"):
+    with refused("several files need an observer whose parameters are θ and the initial error; "
+                 "accepted is observer=gpebo with remedy none, output_injection or noise_free"):
         run("circuit", data={"name": "csv", "file": files}, observer=observer)
 
 

@@ -817,6 +817,8 @@ def by_the_independent_path(rate, edges, **settings):
 def test_growth_beyond_all_numbers_is_refused_by_the_independent_path_without_a_warning():
     with refused("solver=ivp: the law failed after t = 3.", by=GpeboError):
         by_the_independent_path(200.0, [0.0, 1.0, 10.0])
+    with refused("solver=ivp: the law failed after t = 1: ", by=GpeboError):  # in the first step
+        by_the_independent_path(1e300, [1.0, 2.0, 10.0])
 
 
 def test_a_restart_from_what_is_no_number_is_refused_with_its_time():

@@ -559,6 +559,7 @@ def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():
 
     assert labels(("a", "drem", 1.0), ("a", "drem", 10.0)) == ["γ = 10"]
     assert labels(("a", "drem", 1.0), ("a", "mre", 10.0)) == ["mre, γ = 10"]
+    assert labels(("a", "drem", 1.0), ("b", "drem", 10.0)) == ["γ = 10"]
     assert labels(("a", "drem", 1.0), ("b", "drem", 1.0)) == ["b"]
     both = (("a", "drem", 1.0), ("b", "drem", 1.0), ("b", "drem", 10.0))
     assert labels(*both) == ["b, γ = 1", "b, γ = 10"]

@@ -251,18 +251,16 @@ def linear_law(path: ScalarPath, start: Array, gains: Array) -> Array:
 
 def _integrate(path: ScalarPath, start: Array, gains: Array) -> Array:
     """The law itself is integrated, (g, M, p), one stretch of elements after the other."""
-    mesh, rule, p = path.mesh, path.mesh.rule, path.quotient.shape[2]
-    lanes = len(gains) * (rule.stages + 1) * rule.stages * p
-    stretch = int(np.clip(_LANES // lanes, 16, _STRETCH))
-    out = np.empty((len(gains), len(path.t), p))
+    mesh, rule = path.mesh, path.mesh.rule
+    out = np.empty((len(gains), len(path.t), path.quotient.shape[2]))
     element = mesh.sampler(path.t).element
     eta, size = start, path.floor
-    for first in range(0, mesh.size, stretch):
-        piece = Mesh(mesh.edges[first : first + stretch + 1], rule)
-        ends = path.quotient[first : first + stretch, -1]
+    for first in range(0, mesh.size, _STRETCH):
+        piece = Mesh(mesh.edges[first : first + _STRETCH + 1], rule)
+        ends = path.quotient[first : first + _STRETCH, -1]
         piece, values = _resolved(path, piece, ends, eta, gains, size)
         eta, size = values[-1, -1], max(size, float(np.abs(values).max()))
-        within = (element >= first) & (element < first + stretch)
+        within = (element >= first) & (element < first + _STRETCH)
         sampled = piece.sampler(path.t[within])(values)
         out[:, within] = np.swapaxes(sampled, 0, 1)
     return out

@@ -117,9 +117,6 @@ class Online:
         self._rho = settings.excitation.rho
         self.start = start
         self._state: observers.Reached | None = None
-        # S of all data: |S[−η; 1]|² = ∫‖Y − ψη‖²
-        self.root = np.zeros((len(self.parameters) + 1,) * 2)
-        self._final = np.zeros((len(self.cases), len(self.parameters)))
         # When parameters could first be told apart, and when well.
         self._t_c: list[float | None] = [None, None]
         self._system = system
@@ -142,6 +139,7 @@ class Online:
         eta[..., columns] = made.parameters
         whole, _ = self._gram.update(block.regression)
         roots = whole[:, 0]
+        # S of all data: |S[−η; 1]|² = ∫‖Y − ψη‖²
         self.root, self.count = roots[-1], self.count + len(t)
         S = roots[:, :p, :p]
         sigma: Array = np.linalg.svd(S, compute_uv=False).astype(np.float64)

@@ -73,7 +73,7 @@ def joined_observation(
     if len(affine) < len(observations):
         raise ConfigError(
             "data.file: several files need an observer whose parameters are θ and the initial "
-            "error; accepted are observer=gpebo with the remedies none and output_injection"
+            "error; accepted is observer=gpebo with remedy none, output_injection or noise_free"
         )
     shifts, regressions = _shifts(sources), [each.regression for each in observations]
     places = list(accumulate((each.p - q for each in regressions), initial=q))

@@ -416,10 +416,9 @@ def _refuse_crossing(system: DescriptorSystem, t: Array, E: Array) -> None:
     changes = np.flatnonzero(sign[1:] != sign[:-1])
     if not len(changes):
         return
-    there = changes[:1]
     at = halved(
-        lambda t: np.linalg.slogdet(system.coefficients.taylor(t, 0).E[0])[0], sign[there],
-        t[there], t[there + 1],
+        lambda t: np.linalg.slogdet(system.coefficients.taylor(t, 0).E[0])[0], sign[changes],
+        t[changes], t[changes + 1],
     )
     raise ModelError(
         f"{who(system)}: the rank of the differential part changes at t = {at[0]:.9g} (det E "

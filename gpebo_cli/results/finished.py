@@ -125,10 +125,9 @@ def read_run(run: str, folder: Path, overrides: Mapping[str, str]) -> list[Case]
     ``overrides`` distinguish it from others, where that is known (a job of a sweep).
     """
     summary = read_summary(folder)
-    if (estimator := summary.get("estimator")) is None:
+    if not (estimator := _mapping(summary, "estimator")):
         return []
-    name = estimator.get("name") if isinstance(estimator, Mapping) else estimator
-    chosen = {"plant": str(summary.get("plant")), "estimator": str(name)}
+    chosen = {"plant": str(summary.get("plant")), "estimator": str(estimator.get("name"))}
     columns = read_columns(folder / "cases.csv", "case", present=METRICS)
     gains = [name for name in columns if name != "case" and not is_metric(name)]
     metrics = dict.fromkeys((*METRICS, *filter(is_metric, columns)))

@@ -216,11 +216,10 @@ def _in_frame(
     if H.shape[2] and (units.states != 1.0).any():  # as of states in their units
         of_inverse = np.linalg.norm(H / units.states[:, None], axis=(1, 2))
         injectivity = 1.0 / (of_inverse * np.linalg.norm(algebraic * units.states, axis=(1, 2)))
-    size = 0.0 if outside == 0.0 else float(np.abs(model.E / rows[:, None]).max(initial=0.0))
     weakest = float(injectivity.min(initial=np.inf))
-    if not (
-        fits(outside, size, frame.domain.shape[1], inner, inverse, rank_tol) and weakest > rank_tol
-    ):
+    # What is outside, rounding or not, is left to _by_steps.
+    within = fits(outside, 0.0, frame.domain.shape[1], inner, inverse, rank_tol)
+    if not (within and weakest > rank_tol):
         return None
     return ObserverMatrices(
         within_frame(frame, pinv), scale, dynamics, from_unknowns, from_signals, algebraic,
