@@ -217,20 +217,6 @@ def test_windows_together_have_the_largest_errors_and_sizes_of_each():
         assert values.reshape(3, -1).min(axis=1).tolist() == [1.0, 2.0, 0.5]
 
 
-@pytest.mark.parametrize(("eliminated", "shown"), [(0, 1), (1, 2), (2, 3)])
-def test_a_state_that_is_a_coordinate_is_resolved_as_that_or_by_its_gain(eliminated, shown):
-    """Of three states two are coordinates; ``shown`` of them have gains, as they are eliminated."""
-    rng, shapes = np.random.default_rng(0), ((1,), (1, 2), (3,), (3, 2))
-    found = Assembled(
-        *(rng.normal(size=(9, *shape)) for shape in shapes), 1.0, np.ones(2),
-        np.arange(3) < eliminated, np.ones((2, 3)), np.ones((3, 2)),
-    )
-    kinds = list(found.kinds(np.ones(3), np.eye(3, 2)))
-    of_z = [floor.shape for signal, floor in kinds if signal is None]
-    assert of_z == ([(2, 2)] if eliminated < 2 else [])
-    assert kinds[3][0].shape == (9, shown, 2)
-
-
 @pytest.mark.parametrize(("observer", "estimator"), [
     ("kalman_bucy", "ls_drem"),
     *(({"name": "gpebo", "remedy": "current_coordinates"}, e) for e in (

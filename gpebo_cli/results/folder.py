@@ -8,7 +8,7 @@ from gpebo_cli.experiment.result import RunResult
 from gpebo_cli.results.figures import FIGURES, draw
 from gpebo_cli.results.files import alone, make_folder, remove_files, write_text
 from gpebo_cli.results.names import FORMATS
-from gpebo_cli.results.provenance import provenance
+from gpebo_cli.results.provenance import Provenance, provenance
 from gpebo_cli.results.style import save
 from gpebo_cli.results.summary import summary_text
 from gpebo_cli.results.tables import TABLES, write_noise, write_parquet, write_table
@@ -16,7 +16,9 @@ from gpebo_cli.results.tables import TABLES, write_noise, write_parquet, write_t
 _FILES = (*(f"{name}.csv" for name in TABLES), "noise.csv")  # that: of more than one seed only
 
 
-def write_run(result: RunResult, folder: Path, config_text: str) -> None:
+def write_run(
+    result: RunResult, folder: Path, config_text: str, made_by: Provenance | None = None
+) -> None:
     """Write everything a run leaves behind to ``folder``, which is created where needed.
 
     What the run does not have (without an observer: all but the plant's signals) is not written,
@@ -46,4 +48,4 @@ def write_run(result: RunResult, folder: Path, config_text: str) -> None:
             make_folder(folder / "figures")
             for suffix in result.settings.output.formats:
                 save(figure, folder / "figures" / f"{name}.{suffix}")
-        write_text(folder / "summary.json", summary_text(result, provenance()))
+        write_text(folder / "summary.json", summary_text(result, made_by or provenance()))
