@@ -174,16 +174,17 @@ def test_a_kink_of_an_input_in_a_constraint_is_passed_where_an_output_is_followe
         np.testing.assert_allclose(found[1][name], found[0][name], atol=1e-9)
 
 
-def test_a_recorded_input_switches_an_output_between_rows():
+@pytest.mark.parametrize(("start", "level"), [(0.0, 0.3), (1e6, 0.999)])  # near a row, late
+def test_a_recorded_input_switches_an_output_between_rows(start, level):
     # x = 1 + t/2 and the gate are straight lines between rows, so that nothing is interpolated.
     t = np.arange(0.0, 12.01, 0.1)
     gate = (np.sin(1.1 * t) > 0.0) * 1.0
     plant = {
         "name": "gated", "states": ["x"], "inputs": {"gate": 1}, "unknowns": {"a": 0.5},
         "outputs": ["y"], "E": [[1]], "A": [[0]], "B": [[0]], "F": [[1]],
-        "C": [["step(gate - 0.3)"]], "initial_state": {"x": 1},
+        "C": [[f"step(gate - {level})"]], "initial_state": {"x": 1},
     }
-    data = {"t": t, "gate": gate, "y": 1.0 + 0.5 * t}
+    data = {"t": start + t, "gate": gate, "y": 1.0 + 0.5 * t}
     found = run(plant, data=data, estimator="ls_drem", gamma=1e3, time={"samples": 13})
     np.testing.assert_allclose(found.estimates["a"][0, -1], 0.5, rtol=1e-9)
     assert "errors of the observer" not in found.verdict

@@ -27,6 +27,7 @@ MAX_INSTRUCTIONS = 200_000
 MAX_NUMBERS = 2**24  # held at once; longer arrays of times are evaluated in parts
 _SWITCHES = ("abs", "sign", "min", "max")
 _ASIDE = 1e-6  # of a way that is itself 1e-3 of an element: a signal hardly moves there
+_TOLD = 4.0  # times the distance of two numbers: times that are told apart
 _CLEAR = 0.5  # of an argument of a switch: one that moves by less on that way is decided anywhere
 UNKNOWN = Node("number", value=math.nan)  # a signal that nobody has told
 
@@ -453,7 +454,9 @@ def on_their_side(
     if arguments is None or inside is None or inside is t:
         return t
     moved = np.flatnonzero(inside != t)
-    within, there = inside[moved], aside(t[moved], inside[moved])
+    within, way = inside[moved], inside[moved] - t[moved]
+    least = _TOLD * np.spacing(np.abs(within))  # aside may be no other number in a short element
+    there = aside(t[moved], within) + np.sign(way) * least
     at, beside = (
         arguments.taylor(there, 0, within, signals(times, within)[None])[0]
         for times in (t[moved], there)
