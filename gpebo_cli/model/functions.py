@@ -93,6 +93,7 @@ class FunctionCoefficients:
         a function returns the wrong shape, something not finite, or is not analytic where a
         derivative of it is needed; or y is needed and not known).
         """
+        found: dict[str, Array] = {}
         along, m = signals, self.shapes["u"][0]
         if self.signals and signals is None:
             for name in (name for name, depends in self.signals.items() if len(depends) > m):
@@ -100,11 +101,11 @@ class FunctionCoefficients:
                     f"plant {self.name}: {name} depends on the outputs, which are not known here"
                 )
             nothing = np.zeros((order + 1, len(t), self.outputs))
-            along = np.concatenate([self._values("u", t, order, None), nothing], axis=2)
-        found = {
-            name: self._values(name, t, order, along if name in self.signals else None)
-            for name in MATRIX_NAMES
-        }
+            found["u"] = self._values("u", t, order, None)
+            along = np.concatenate([found["u"], nothing], axis=2)
+        for name in MATRIX_NAMES:
+            if name not in found:
+                found[name] = self._values(name, t, order, along if name in self.signals else None)
         for name, (i, j) in self.places.items():
             values = found[name]
             found[name] = np.zeros((*values.shape[:2], *self.whole[name]))
