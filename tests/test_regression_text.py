@@ -341,3 +341,19 @@ def test_sizes_so_far_are_handed_on_from_piece_to_piece():
     for part in (slice(0, 5), slice(5, 30), slice(30, 60)):
         state, piece = text.advance("linear", state, t[part], u[part], u[part])
         np.testing.assert_allclose(piece.scale, whole.scale[part], rtol=1e-12)
+
+
+def test_what_a_column_switches_near_a_row_is_on_its_side_at_late_times():
+    """The jump is 1e-4 s before a row, where a billionth of the element is no other number."""
+    t = np.arange(0.0, 12.01, 0.1)
+    gate = (np.sin(1.1 * t) > 0.0) * 1.0
+    on = "step(gate - 0.999)"
+    plan = {
+        "name": "gated", "signals": {"gate": 1, "y": 1}, "unknowns": {"a": 2},
+        "Y": [f"{on}*y"], "psi": [[on]],
+    }
+    found = run(
+        regression=plan, data={"t": 1e6 + t, "gate": gate, "y": 2.0 + 0.0 * t},
+        estimator="least_squares", time={"samples": 13},
+    )
+    assert found.details.regression.error_estimate < 1e-9

@@ -213,8 +213,9 @@ class Tape:
             if deciding is None:
                 last = max(switch.argument for switch in self.switches) + 1
                 deciding = self.run(inside, 0, inside, signals, last)
-                if followers:
-                    beside = self.run(aside(t, inside), 0, inside, signals, last, deciding)
+                if followers:  # as ``aside`` has it, of symbols, too
+                    near = t + _ASIDE * (inside - t)
+                    beside = self.run(near, 0, inside, signals, last, deciding)
         places: list[Jet] = []
         for (operation, arguments, value), extra in zip(
             self.instructions[:stop], self.extra[:stop], strict=True
@@ -437,9 +438,11 @@ def _labels(
     )
 
 
-def aside(t: Any, inside: Any) -> Any:
+def aside(t: Array, inside: Array) -> Array:
     """Times (N,) so little from t towards ``inside`` that only what jumps there is another one."""
-    return t + _ASIDE * (inside - t)
+    way = inside - t
+    least = _TOLD * np.spacing(np.abs(t))  # so near may be no other number in a short element
+    return np.asarray(t + np.sign(way) * np.maximum(_ASIDE * np.abs(way), least))
 
 
 def on_their_side(
@@ -454,9 +457,7 @@ def on_their_side(
     if arguments is None or inside is None or inside is t:
         return t
     moved = np.flatnonzero(inside != t)
-    within, way = inside[moved], inside[moved] - t[moved]
-    least = _TOLD * np.spacing(np.abs(within))  # aside may be no other number in a short element
-    there = aside(t[moved], within) + np.sign(way) * least
+    within, there = inside[moved], aside(t[moved], inside[moved])
     at, beside = (
         arguments.taylor(there, 0, within, signals(times, within)[None])[0]
         for times in (t[moved], there)
