@@ -2,13 +2,10 @@
 
 int lanes_scratch(Call *call, const npy_intp *sizes, Lane ***parts, size_t count)
 {
-    npy_intp total = 0;
-    for (size_t i = 0; i < count; i++)
-        total += sizes[i];
-    Lane *memory = (Lane *)scratch(call, total * LANES);
-    for (size_t i = 0; memory != NULL && i < count; memory += sizes[i++])
-        *parts[i] = memory;
-    return memory != NULL;
+    for (size_t i = 0; i < count; i++) /* each by itself: sanitizers see what leaves its own */
+        if ((*parts[i] = (Lane *)scratch(call, sizes[i] * LANES)) == NULL)
+            return 0;
+    return 1;
 }
 
 void lanes_load(Lane *to, const double *from, npy_intp step, npy_intp entries, npy_intp first,

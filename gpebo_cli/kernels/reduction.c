@@ -27,22 +27,17 @@ static Outcome begin(Call *call, int place, const Model *m, Elimination *el)
         if (el->rows[i] < 0 || el->rows[i] >= size || el->columns[i] < 0 || el->columns[i] >= size)
             return refused("a row or a column of M", i);
     const npy_intp widest = r > n ? r : n;
-    const npy_intp sizes[] = {n * size,
-                              n * size,
-                              r * r,
-                              r * a,
-                              a * r,
-                              a * a,
-                              a * r,
-                              r * n,
-                              a * n,
-                              n * n,
-                              n * n,
-                              n * (n - a),
-                              2 * widest * (widest + n + 1)};
-    Lane **parts[] = {&el->e,  &el->A,  &el->M11,   &el->M12,     &el->M21, &el->M22, &el->X,
-                      &el->N1, &el->N2, &el->whole, &el->inverse, &el->Q,   &el->work};
-    return lanes_scratch(call, sizes, parts, LENGTH(sizes)) ? DONE : ERROR;
+    const npy_intp sizes[] = {n * size,    n * size,
+                              size * size, a * r,
+                              r * n,       a * n,
+                              n * n,       n * n,
+                              n * el->d,   2 * widest * (widest + n + 1)};
+    Lane **parts[] = {&el->e,  &el->A,     &el->M11,     &el->X, &el->N1,
+                      &el->N2, &el->whole, &el->inverse, &el->Q, &el->work};
+    if (!lanes_scratch(call, sizes, parts, LENGTH(sizes)))
+        return ERROR;
+    el->M12 = el->M11 + r * r, el->M21 = el->M12 + r * a, el->M22 = el->M21 + a * r;
+    return DONE;
 }
 
 /* The first coefficients at some times, each order times a power of `time` and of `weights`. */
@@ -91,7 +86,7 @@ EVERY_WIDTH static void fill(const Model *m, Elimination *el, npy_intp first, np
     block_of(m, el, 0, r, r, size, el->M12);
     block_of(m, el, r, size, 0, r, el->M21);
     block_of(m, el, r, size, r, size, el->M22);
-    lanes_norm(el->of_M, el->M11, size * size); /* the four lie one behind the other */
+    lanes_norm(el->of_M, el->M11, size * size); /* of all four */
     lanes_norm(el->of_N, el->A, n * size);
     EACH el->of_M[l] += DBL_MIN, el->of_N[l] += DBL_MIN;
     for (npy_intp p = 0; p < size; p++)
@@ -266,7 +261,7 @@ static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first
                      npy_intp matrices, double growth, double residual, double *const *out)
 {
     const npy_intp n = m->n, r = el->rank, a = el->a, d = el->d;
-    Lane grown, *some = el->e, *f2 = el->M22;
+    Lane grown, *some = el->e, *f1 = el->work, *f2 = f1 + r;
     const npy_intp these = matrices == 1 ? 1 : used, fresh = matrices > 1 || first == 0;
     force(m, f, first, used);
     if (fresh) {
@@ -287,8 +282,8 @@ static int equations(const Model *m, Elimination *el, Forcing *f, npy_intp first
     lanes_product(some, 1, el->Q, 1, d, f->g, 1, d, n, 1, SET);
     lanes_store(out[2], some, 1, d, 0, d, first, used);
     for (npy_intp k = 0; k < m->size; k++)
-        memcpy(k < r ? el->M12 + k : f2 + (k - r), f->g + el->rows[k], sizeof(Lane));
-    lanes_multiply(f2, 1, el->X, r, el->M12, 1, a, r, 1, SUBTRACT);
+        memcpy(f1 + k, f->g + el->rows[k], sizeof(Lane));
+    lanes_multiply(f2, 1, el->X, r, f1, 1, a, r, 1, SUBTRACT);
     lanes_store(out[4], f2, 1, a, 0, a, first, used);
     lanes_clear(some, n);
     lanes_multiply(some, 1, el->inverse + d, n, f2, 1, n, a, 1, SUBTRACT);
