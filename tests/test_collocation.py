@@ -549,6 +549,27 @@ def test_a_short_element_keeps_the_digits_of_equations_without_derivatives():
         assert np.abs(left).max() < 1e-13
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e6, 1e-6])
+def test_a_slow_mode_is_not_solved_for_with_rows_of_a_fast_one(unit):
+    """At one node of each element the bases are turned by 1e-6: 1e-10 were lost of cos t."""
+    units, slope = np.array([[1.0], [unit]]), np.diag([-1.0, -1e8])
+
+    def coefficients(t, inside):
+        turned = 1e-6 * (np.arange(len(t)) % 15 == 7)[:, None, None]
+        R = np.eye(2) + turned * np.array([[0.0, 1.0], [-1.0, 0.0]])
+        T = units * np.swapaxes(R, 1, 2) / (1.0 + turned**2)
+        z, moves = np.stack([np.cos(t), np.sin(t)], 1), np.stack([-np.sin(t), np.cos(t)], 1)
+        f = R @ (moves - z @ slope)[:, :, None]
+        return LinearEquation(
+            R / units.T, R @ slope / units.T, f, (), Constraints(T, np.zeros_like(f))
+        )
+
+    mesh = initial_mesh(0.0, 1.0, [], 4, radau_rule(14))
+    problem = LinearProblem(coefficients, units * [[1.0], [0.0]], units=units, rate=1e8)
+    for found in by_both(lambda: solve(problem, mesh, tol=1e-9, max_elements=9)):
+        assert abs(found.trajectory.final[0, 0] - np.cos(1.0)) < 1e-13
+
+
 @pytest.mark.parametrize(("start", "said"), [(1e9, "begin at 0"), (0.5, "a jump or a singularity")])
 def test_elements_as_short_as_times_are_told_apart_say_why(start, said):
     """A tail that no cut makes smaller, in the second element."""

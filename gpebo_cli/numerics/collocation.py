@@ -48,7 +48,7 @@ from gpebo_cli.numerics.mesh import (
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine
-from gpebo_cli.numerics.rounding import kept_share, noise_of, noise_of_instants
+from gpebo_cli.numerics.rounding import FAST, kept_share, noise_of, noise_of_instants
 
 _CHUNK = 1 << 20  # numbers of maps that are made at once (8 MB)
 _DIRECT = 400  # unknowns
@@ -266,17 +266,39 @@ def _is_constant(c: LinearEquation) -> bool:
     return all(matrix is None or len(matrix) == 1 for matrix in (c.E, c.A, basis))
 
 
+def _rows_alike(
+    problem: LinearProblem, rule: RadauRule, h: Array, c: LinearEquation
+) -> LinearEquation:
+    """The equation with rows among which pivots may be chosen, in elements of lengths h (K,).
+
+    In a short element D/h is large beside rows without E, whose unknowns would be taken from rows
+    with it, and lose their digits: those are divided by h, too. In a long one rows of a fast mode
+    are large. Where bases turn from node to node they would serve slow unknowns, which would have
+    their rounding: all rows come to the size one, in units of the states.
+    """
+    E, units = c.E, problem.units
+    if E is None or len(c.A) == 1:
+        return c
+    if units is None or problem.rate * h.max(initial=0.0) < FAST:
+        if (some := E.any(axis=(0, 2))).all():
+            return c
+        weights = np.where(some, 1.0, (1.0 / h).repeat(rule.stages + 1)[:, None])[..., None]
+        return c._replace(A=c.A * weights, f=c.f * weights)
+    of_E, T = np.abs(E) @ units, c.constraints and c.constraints.basis
+    of_A = np.abs(c.A) @ units if T is None else np.abs(c.A @ T) @ of_E
+    slopes = np.append(0.0, np.abs(rule.differentiation).max(axis=1)) / h[:, None]
+    size = np.maximum(of_E * slopes.reshape(-1, 1, 1), of_A)
+    size[size == 0.0] = 1.0
+    return c._replace(E=E / size, A=c.A / size, f=c.f / size)
+
+
 def _solve_elements(
     problem: LinearProblem, mesh: Mesh, h: Array, t: Array, c: LinearEquation
 ) -> _Maps:
     k, s = len(h), mesh.rule.stages
     basis, offset = (None, None) if c.constraints is None else c.constraints
     group, groups = np.arange(k), k
-    if c.E is not None and len(c.A) > 1 and not (some := c.E.any(axis=(0, 2))).all():
-        # In a short element D/h is large beside rows without E, whose unknowns would be taken from
-        # rows with it, and lose their digits: those are divided by h, too.
-        weights = np.where(some, 1.0, (1.0 / h).repeat(s + 1)[:, None])[..., None]
-        c = c._replace(A=c.A * weights, f=c.f * weights)
+    rows = _rows_alike(problem, mesh.rule, h, c)
     solve: Callable[..., tuple[Array, Array]] = elements.element_maps
     if _is_constant(c):
         group, h = equal_lengths(h, mesh)
@@ -288,7 +310,7 @@ def _solve_elements(
         found = taylor.element_maps(mesh.rule, h, c.A, c.f)
     try:
         homogeneous, particular = found or solve(
-            mesh.rule.differentiation, h, c.E, c.A, c.f, basis, offset, group, groups
+            mesh.rule.differentiation, h, rows.E, rows.A, rows.f, basis, offset, group, groups
         )
     except np.linalg.LinAlgError as error:
         raise SolverError(

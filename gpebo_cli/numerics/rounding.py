@@ -16,7 +16,7 @@ from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 
 _MUCH = 1e3  # roundings of the largest value, from which on it is worth while to look closer
-_FAST = 100.0  # a rate times the length of an element in which little would be forgotten below
+FAST = 100.0  # a rate times the length of an element in which little would be forgotten below
 _GROWING = 8.0  # times the share of an element that is over: no swing that is resolved averages it
 _AT_ONCE = 256  # elements
 
@@ -67,7 +67,7 @@ def kept_share(problem: LinearProblem, mesh: Mesh, noise: Array, values: Array) 
     It is looked at where that is much and equations are fast. Rounding of one term knows nothing of
     another's, nor at one node of that at the next; where A is constant, it is the same at all.
     """
-    fast = mesh.steps * problem.rate > _FAST
+    fast = mesh.steps * problem.rate > FAST
     if not fast.any():
         return np.ones((1, 1, 1))
     sizes, share = largest_within(values), np.ones((mesh.size, values.shape[2], 1))
