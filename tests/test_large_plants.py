@@ -980,6 +980,22 @@ def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, mo
     assert 1.0 < ratio.min() <= ratio.max() < most
 
 
+def test_rounding_adds_up_in_stiff_elements_as_in_collocation():
+    """What swings forgets no rounding of right ends, and polynomials leave nothing out."""
+    A, one = np.kron(np.eye(5), [[0.0, 1.0], [-1.0, 0.0]])[None], np.ones((10, 1))
+    f, limits = np.zeros((1, 10, 1)), {"tol": 1e-10, "max_elements": 200}
+    problem = LinearProblem(
+        lambda t, inside: LinearEquation(None, A, f), one, name="turns", units=one
+    )
+    mesh = initial_mesh(0.0, 200.0, [], 200, radau_rule(14))
+    found, other = series.solve(
+        problem, lambda mesh: (taylor.by_entries(A), f, ()), mesh,
+        units=np.ones(10), stiff=True, **limits,
+    ), solve(problem, mesh, **limits)
+    ratio = found.errors / other.errors
+    assert 0.8 < ratio.min() <= ratio.max() < 2.0
+
+
 def test_units_of_many_states_are_those_of_full_equations(monkeypatch):
     """A ladder in units of all sizes, by sparse factors as by dense ones."""
     rng = np.random.default_rng(3)
