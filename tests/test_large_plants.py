@@ -986,6 +986,19 @@ def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, mo
     assert (0.25 if late else 1.0) < ratio.min() <= ratio.max() < most
 
 
+def test_errors_of_series_see_noise_that_no_mesh_resolves():
+    """x' = cos t + 1e-6 sin 1e9t: coefficients of the polynomials do not fall."""
+    def coefficients(t, inside):
+        f = np.cos(t) + 1e-6 * np.sin(1e9 * t)
+        return LinearEquation(None, np.zeros((1, 9, 9)), f[:, None, None] * np.ones((9, 1)))
+
+    problem = LinearProblem(coefficients, np.zeros((9, 1)), name="noise", units=np.ones((9, 1)))
+    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(10))
+    found = series.solve_dense(problem, mesh, tol=1e-8, max_elements=20)
+    error = np.abs(found.trajectory.values[:, :, 0, 0] - np.sin(mesh.points)).max()
+    assert 1e-8 < error < 5.0 * found.errors[0, 0]
+
+
 def test_rounding_adds_up_in_stiff_elements_as_in_collocation():
     """What swings forgets no rounding of right ends, and polynomials leave nothing out."""
     A, one = np.kron(np.eye(5), [[0.0, 1.0], [-1.0, 0.0]])[None], np.ones((10, 1))
