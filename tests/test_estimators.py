@@ -26,6 +26,7 @@ from gpebo_cli.estimators._scalar import (
     lion,
     lion_rows,
     low_pass,
+    mix,
     scalar_law,
     scalar_path,
 )
@@ -1357,3 +1358,16 @@ def test_a_memory_that_begins_with_the_data_is_soon_resolved(monkeypatch, start)
     )
     assert found.details.estimation.requirement.holds
     assert 0 < len(rounds) < 60
+
+
+@pytest.mark.parametrize(("size", "fits"), [(1e150, True), (1e160, False)])
+def test_what_is_mixed_has_squares_that_are_numbers(size, fits):
+    mesh = initial_mesh(0.0, 1.0, [], 4, radau_rule(3))
+    extended = Trajectory(mesh, np.broadcast_to([[size, 3.0 * size]], (4, 4, 1, 2)))
+    if fits:
+        np.testing.assert_allclose(mix(extended, np.array([1.0])).quotient, 3.0, rtol=1e-15)
+    else:
+        with np.errstate(over="ignore"), pytest.raises(
+            SolverError, match=r"Δ² of Δ = det\(Ω\) is too large .* near t = 0;"
+        ):
+            mix(extended, np.array([1.0]))

@@ -624,6 +624,21 @@ def test_a_hanging_pendulum_swings_by_the_force_of_its_rod():
     }
 
 
+def test_drag_that_grows_with_speed_damps_by_the_speed_on_the_way():
+    """x'' + (x')² on a belt y = x with x₀ = t²/2: 2 x₀' δx', and the belt's force is not moved."""
+    t = sp.Symbol("t")
+    x, y = (sp.Function(name)(t) for name in "xy")
+    model = linearise(
+        [x.diff(t, 2) + x.diff(t) ** 2, y.diff(t, 2) * x], [y - x],
+        {x: t**2 / 2, y: t**2 / 2}, [t],
+    )
+    assert model == {
+        "positions": ["x", "y"],
+        "M": [["1", "0"], ["0", "t**2/2"]], "D": [["2*t", "0"], ["0", "0"]],
+        "K": [["0", "0"], ["1", "0"]], "G": [["-1", "1"]],
+    }
+
+
 def test_entries_of_a_mechanism_may_be_numbers_and_text_of_either_sign():
     """M q'' + D q' + K q = B u."""
     draft = from_mechanics({
@@ -1033,8 +1048,11 @@ def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr("gpebo_cli.model.archive.MAX_BYTES", 100_000)
     savemat(tmp_path / "bomb.mat", {"A": np.zeros((150, 150))}, do_compression=True)
     assert (tmp_path / "bomb.mat").stat().st_size < 1_000
-    head = "%%MatrixMarket matrix array real general\n1000000 1000000\n1\n"
+    head = "%%MatrixMarket matrix coordinate real general\n2 1000000 1\n1 1 1\n"
     (tmp_path / "A.mtx").write_text(head)
+    (tmp_path / "full").mkdir()
+    full = "%%MatrixMarket matrix array real general\n2000 2000\n1\n"
+    (tmp_path / "full" / "A.mtx").write_text(full)
     content = (tmp_path / "bomb.mat").read_bytes()
     savemat(tmp_path / "behind.mat", {"x": np.eye(2)})  # a bomb behind what is not packed
     (tmp_path / "behind.mat").write_bytes((tmp_path / "behind.mat").read_bytes() + content[128:])
@@ -1047,7 +1065,8 @@ def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):
     for path, message in (
         (tmp_path / "bomb.mat", "unpacks to more"), (tmp_path / "behind.mat", "unpacks to more"),
         (tmp_path / "cell.mat", "no matrix A"),
-        (tmp_path, f"has {len(head)} bytes with 1000000 × 1000000 entries; .* and 2000 rows and c"),
+        (tmp_path, f"has {len(head)} bytes with 2 × 1000000 entries; .* and 2000 rows and c"),
+        (tmp_path / "full", f"has {len(full)} bytes with 2000 × 2000 entries"),
     ):
         with pytest.raises(ConfigError, match=message):
             from_file(path, "p")

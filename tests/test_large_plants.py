@@ -986,6 +986,22 @@ def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, mo
     assert (0.25 if late else 1.0) < ratio.min() <= ratio.max() < most
 
 
+def test_series_that_end_where_a_component_is_lost_lose_it_there():
+    """From e^−5t rounding grows with e^5t, and is larger than what the state ever was."""
+    A = np.kron(np.eye(5), [[0.0, 5.0], [5.0, 0.0]])[None]
+    start = np.tile([[1.0], [-1.0]], (5, 1))
+    problem = LinearProblem(lambda t, inside: LinearEquation(None, A, 0.0 * A[..., :1]), start)
+
+    def lost(horizon):
+        mesh = initial_mesh(0.0, horizon, [], int(10 * horizon), radau_rule(9))
+        return series.solve_dense(problem, mesh, tol=1e-12, max_elements=200).lost
+
+    first = lost(10.0)
+    assert 5.0 < first < 8.0
+    assert lost(first) == pytest.approx(first)
+    assert lost(first - 0.1) is None
+
+
 def test_errors_of_series_see_noise_that_no_mesh_resolves():
     """x' = cos t + 1e-6 sin 1e9t: coefficients of the polynomials do not fall."""
     def coefficients(t, inside):
