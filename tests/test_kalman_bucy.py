@@ -438,6 +438,18 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     assert (told in result.verdict) == (level != "given")
 
 
+def test_a_recording_that_is_fitted_exactly_has_no_level_of_noise():
+    """Two rows, and three states to fit them with."""
+    plant = {
+        "name": "p", "states": ["x", "v", "w"], "outputs": ["y"], "E": np.eye(3).tolist(),
+        "A": [[0, 1, 0], [-1, -0.1, 1], [0, 0, -1]], "C": [[1, 0, 0]], "initial_state": [1, 0, 0],
+    }
+    data = pd.DataFrame({"t": [0.0, 1.0], "y": [1.0, 0.4]})
+    found = api_run(plant, observer="kalman_bucy", data=data, time={"samples": 3})
+    assert "noise of the outputs taken from" not in found.verdict
+    assert np.isnan(found.details.estimation.states_std).all()
+
+
 @pytest.mark.parametrize(("rate", "told"), [
     (-0.5, "explain the data up to white noise, 1.0"),
     (-0.525, "times what the sensors' noise makes, is not white"),

@@ -275,6 +275,14 @@ def test_so_it_may_in_a_stream():
     np.testing.assert_allclose(online.natural_sizes * of_psi, of_Y, rtol=1e-9)
 
 
+@pytest.mark.parametrize(("hold", "between"), [("zoh", 2.5), ("linear", 2.5), ("cubic", 2.25)])
+def test_true_states_between_rows_are_splines_where_outputs_are(hold, between):
+    t = np.arange(5.0)
+    data = DataSettings("csv", frame=pd.DataFrame({"t": t, "y": t, "x": t**2}), hold=hold)
+    found = load(plant_from_mapping(one_state()), data, WHOLE, 1e-9).states(np.array([1.5]))
+    np.testing.assert_allclose(found, [[between]], rtol=1e-12)
+
+
 def test_elements_end_where_one_of_the_signals_bends():
     """A spline beside an input that is held, and derivatives of the former alone."""
     t = np.linspace(0.0, 4.0, 401)
@@ -861,6 +869,8 @@ def test_of_columns_with_the_unit_the_most_similar_name_is_taken(tmp_path):
         found = guess(str(path), system)
         assert found.columns == {"t": "t", "v_in": "Vin (V)", "v_out": "Vout (V)"}
         assert found.reasons["v_in"] == "its unit, as of others: LOOK AT IT"
+    path.write_text("t,v_in,Vout (V),Vaux (V)\n0,1,2,3\n1,2,3,4\n")
+    assert guess(str(path), system).reasons["v_in"] == "the same name"
 
 
 def test_an_output_called_T_is_no_time(tmp_path):
