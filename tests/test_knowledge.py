@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from plants import one_state, shipped
 from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
+from units import Units, in_units
 
 from gpebo_cli import from_mechanics, from_netlist, run
 from gpebo_cli.evidence.knowledge import knowledge
@@ -343,6 +344,20 @@ def test_deviations_fall_by_the_mean_of_what_both_know():
     before = {"a": 4.0, "b": 1.0, "c": 0.0}
     assert _fall(before, {"a": 1.0, "b": 2.0, "c": 1.0}) == pytest.approx(2.0)
     assert _fall(before, {"c": 1.0}) == 1.0
+
+
+def test_what_sensors_are_worth_does_not_depend_on_units_of_states():
+    """Of states that are known without any output there is nothing to fall."""
+    plant = yaml.safe_load((CONF / "plant" / "circuit.yaml").read_text())
+    observer = {"name": "gpebo", "form": "strangeness_free"}
+    settings = Settings({"name": "ls_drem"}, TimeSettings(horizon=5.0), observer=observer)
+    one, states = np.ones(6), 10.0 ** np.array([6, 0, -6, 6, 0, -6])
+    other = in_units(plant, Units(states, one[:0], one[:1], one[:1], one, 1.0))
+    falls = [
+        {s.state: s.fall for s in candidates(settings, plant_from_mapping(each))}
+        for each in (plant, other)
+    ]
+    assert falls[1] == pytest.approx(falls[0], rel=1e-4)
 
 
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])
