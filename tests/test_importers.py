@@ -469,6 +469,12 @@ def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
     assert -1 / found.A[0, 0, 0, 0] == 0.25
 
 
+def test_voltages_that_are_saved_are_outputs_where_nothing_else_is_measured():
+    text = "t\nV1 a 0 {sin(t)}\nR1 a b 2\nC1 b 0 1\n.save v(b) i(R1)\n"
+    names = [plant_of(text, measure=measure)["outputs"] for measure in (None, "v(a)")]
+    assert names == [["y_b"], ["y_a"]]
+
+
 def test_what_continues_and_what_is_a_comment():
     text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.save\n.end\nR1 a 0 2\n"
     netlist = read_netlist(text)

@@ -360,6 +360,18 @@ def test_what_sensors_are_worth_does_not_depend_on_units_of_states():
     assert falls[1] == pytest.approx(falls[0], rel=1e-4)
 
 
+def test_a_sensor_of_a_state_that_is_zero_is_one_of_a_state_as_large_as_outputs():
+    plant = one_state(states=["x", "z"], E=[[1, 0], [0, 1]], A=[[-1, 1], [0, -2]], C=[[1, 0]],
+                      initial_state=[1, 0])
+    both = plant | {"outputs": ["y", "w"], "C": [[1, 0], [0, 1]]}
+    observer = {"name": "gpebo", "form": "strangeness_free"}
+    settings = Settings({"name": "ls_drem"}, TimeSettings(horizon=3.0), observer=observer)
+    alone, more = (examine(settings, plant_from_mapping(p)).deviations for p in (plant, both))
+    (best, *_) = candidates(settings, plant_from_mapping(plant))
+    falls = [np.log(alone[k] / more[k]) for k in alone]
+    assert (best.state, best.fall) == ("z", pytest.approx(np.exp(np.mean(falls)), rel=1e-2))
+
+
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])
 def test_the_next_sensors_make_deviations_fall_as_runs_with_them_say(plant_name, count):
     """By the covariance of a run with one more row of C; the best first, beside those above.

@@ -37,6 +37,7 @@ from gpebo_cli.recordings.hold import bends, edges, held, recording_mesh
 from gpebo_cli.recordings.lines import DATE, LineReader, seconds
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import read_table
+from gpebo_cli.results.finished import read_columns, read_errors, read_run
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
@@ -273,6 +274,17 @@ def test_so_it_may_in_a_stream():
     np.testing.assert_allclose(made.parameters[0, -1, :2], [2.5, 0.4], atol=1e-11)
     *of_psi, of_Y = np.linalg.norm(made.regression.weighted(), axis=(0, 1))
     np.testing.assert_allclose(online.natural_sizes * of_psi, of_Y, rtol=1e-9)
+
+
+def test_of_states_that_nobody_measured_there_are_no_errors_to_be_compared(tmp_path):
+    t = np.linspace(0.0, 3.0, 31)
+    plant = one_state(states=["x", "v"], E=[[1, 0], [0, 1]], A=[[0, 1], [-1, 0]], C=[[1, 0]],
+                      initial_state=[1, 0])
+    data = {"t": t, "y": np.cos(t), "x": np.cos(t)}
+    run(plant, data=data, time={"samples": 31}).save(tmp_path, figures=False)
+    (found,) = read_errors(read_run("r", tmp_path, {}))
+    x = read_columns(tmp_path / "estimates.csv")["x_hat"]
+    np.testing.assert_allclose(found.states, np.abs(x - np.cos(found.t)), atol=1e-9)
 
 
 @pytest.mark.parametrize(("hold", "between"), [("zoh", 2.5), ("linear", 2.5), ("cubic", 2.25)])
