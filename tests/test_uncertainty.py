@@ -410,6 +410,15 @@ def test_what_the_residual_of_a_right_plant_is_coloured_by_is_said():
     assert "which noise of u does; or it suggests" in run(plant, data=seen, noise=levels).verdict
 
 
+def test_of_a_recording_whose_noise_is_in_the_matrices_no_residual_is_judged():
+    t = np.linspace(0.0, 3.0, 31)
+    plant = one_state(A=[["-1 - 0.3*y"]], B=[[1]], inputs={"u": 0})
+    data = {"t": t, "u": np.sin(t), "y": np.exp(-t)}
+    said = run(plant, data=data, noise={"name": "gaussian", "outputs": 0.1}).verdict
+    assert "no standard deviations: noise of the signals is in the matrices" in said
+    assert "white noise" not in said
+
+
 def test_at_samples_matrices_may_follow_an_input_without_noise():
     """A pump's gain: F follows u, whose samples are exact; y alone is noisy."""
     system = plant_from_mapping(TANK, "tank")
