@@ -17,6 +17,7 @@ from scipy.integrate import cumulative_trapezoid, quad, quad_vec, solve_ivp, tra
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
+from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
@@ -1391,3 +1392,20 @@ def test_of_a_gain_that_memory_paces_no_other_one_is_told(paced, text):
         np.array([[3.0, 2.0]]), 0.5, "IE", 4.0, "a fall to 1 %", paced=paced
     )
     assert (found.text, found.holds) == (text, False)
+
+
+def test_each_of_several_estimators_has_a_gain_of_its_own():
+    plant = one_state(A=[[-1]])
+
+    def gains(**settings):
+        found = api_run(plant, estimator={"name": "instrumental", "gamma": "auto", **settings},
+                        time={"horizon": 2.0})
+        return [case["gamma"] for case in found.cases]
+
+    assert gains(delay=[0.2, 0.4]) == pytest.approx([*gains(delay=0.2), *gains(delay=0.4)])
+
+
+def test_a_gain_that_no_data_ask_for_is_the_usual_one():
+    plant = one_state(A=[[-1]], C=[["max(0, t - 8)"]])
+    found = api_run(plant, estimator="drem", gamma="auto", time={"horizon": 3.0})
+    assert [case["gamma"] for case in found.cases] == [1e10]

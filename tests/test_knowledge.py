@@ -8,6 +8,7 @@ from itertools import compress
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from examples import gpebo
@@ -370,6 +371,15 @@ def test_a_sensor_of_a_state_that_is_zero_is_one_of_a_state_as_large_as_outputs(
     (best, *_) = candidates(settings, plant_from_mapping(plant))
     falls = [np.log(alone[k] / more[k]) for k in alone]
     assert (best.state, best.fall) == ("z", pytest.approx(np.exp(np.mean(falls)), rel=1e-2))
+
+
+def test_deviations_for_noise_of_one_are_by_the_rows_of_a_recording():
+    """A constant that is measured 20 times, each row held up to the next one."""
+    t = np.arange(21.0)
+    data = DataSettings("csv", frame=pd.DataFrame({"t": t, "y": np.ones(21)}), hold="zoh")
+    settings = Settings({"name": "drem"}, TimeSettings(-np.inf, np.inf, 11), data=data)
+    found = examine(settings, plant_from_mapping(one_state())).deviations
+    assert found["x"] == pytest.approx(1.0 / np.sqrt(20.0), rel=1e-3)
 
 
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])
