@@ -883,6 +883,9 @@ def test_of_columns_with_the_unit_the_most_similar_name_is_taken(tmp_path):
         assert found.reasons["v_in"] == "its unit, as of others: LOOK AT IT"
     path.write_text("t,v_in,Vout (V),Vaux (V)\n0,1,2,3\n1,2,3,4\n")
     assert guess(str(path), system).reasons["v_in"] == "the same name"
+    path.write_text("t,a,v_inp,voltage_out\n0,1,2,3\n1,2,3,4\n")
+    found = guess(str(path), plant_from_mapping(plant))
+    assert (found.columns["v_in"], found.reasons["v_in"]) == ("v_inp", "a similar name")
 
 
 def test_an_output_called_T_is_no_time(tmp_path):
