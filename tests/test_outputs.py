@@ -18,7 +18,7 @@ import pytest
 from factories import STATES, make_result, with_figures, without_observer
 from processes import read_table, refused
 
-from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.errors import ConfigError, GpeboError, printable
 from gpebo_cli.experiment.result import (
     ActiveBound,
     EstimationResult,
@@ -461,3 +461,7 @@ def test_columns_of_a_table_are_as_wide_as_their_longest_cells():
     rows = [["gamma", "x"], ["1", "-12.5"]]
     assert columns(rows) == ["gamma      x", "    1  -12.5"]
     assert columns(rows, str.ljust) == ["gamma  x    ", "1      -12.5"]
+
+
+def test_what_would_command_a_terminal_is_written_and_a_backslash_is_one():
+    assert printable("C:\\a\x1b[2J ü\n") == "C:\\a\\x1b[2J ü\\n"
