@@ -367,3 +367,15 @@ def test_a_state_that_an_input_determines_later_is_held_where_estimates_move_it(
     found = run(plant, observer=observer, estimator="least_squares",
                 time={"horizon": 4, "samples": 2}).estimates
     np.testing.assert_allclose([found["k"][0, -1], found["x"][0, -1]], 0.8, rtol=1e-6)
+
+
+@pytest.mark.parametrize("end", [1, 70, 300])
+def test_rows_below_a_bound_are_in_groups_that_may_be(end):
+    rng = np.random.default_rng(3)
+    normals, levels, eta = rng.normal(size=(2, 300, 3)), np.full((2, 300), -1e3), rng.normal(size=3)
+    for below in (0, 63, 64, 299):
+        levels[:] = -1e3
+        levels[1, below] = normals[1, below] @ eta + 1.0
+        near = bounds_._Groups.of(normals, levels).near(eta, np.ones(2), end)
+        assert (below in near) == (below < end)
+        assert len(near) < 300

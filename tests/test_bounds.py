@@ -17,7 +17,7 @@ from test_kernels_jets import tape_of, texts
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved, signal
-from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.expressions.intervals import Interval, polynomials
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
@@ -406,3 +406,13 @@ def test_smooth_functions_cost_no_cells():
     found, short = resolved(Bounds(tape), edges)
     assert short
     np.testing.assert_array_equal(found, edges)
+
+
+@pytest.mark.parametrize("half", [0.1, 3.0])
+def test_coefficients_of_a_polynomial_anywhere_in_a_cell_are_within_its_bounds(half):
+    """Of ±(1 + x + … + x³) about the middle of the cell: at its right end they are the bounds."""
+    c = np.array([[1.0, -1.0]] * 4)
+    found = polynomials(c, np.full(2, half))
+    exact = [1 + half + half**2 + half**3, 1 + 2 * half + 3 * half**2, 1 + 3 * half, 1.0]
+    np.testing.assert_allclose([each.high[0] for each in found], exact)
+    np.testing.assert_allclose([each.low[1] for each in found], np.negative(exact))

@@ -536,14 +536,16 @@ def test_what_says_against_an_index_is_named_with_its_time():
     assert _why_not(t, smallest, 1e-10) == said
 
 
-@pytest.mark.parametrize(("max_mu", "said"), [
-    (0, "0 differentiations constraints are linearly dependent at t = 0.001"),
-    (2, "2 differentiations 4 constraints appear for 3 states (t = 0.001)"),
+@pytest.mark.parametrize(("entry", "max_mu", "said"), [
+    (-1, 0, "0 differentiations constraints are linearly dependent at t = 0.001"),
+    (-1, 2, "2 differentiations 4 constraints appear for 3 states (t = 0.001)"),
+    ("-1 - t", 0, "0 differentiations constraints are linearly dependent at t = 0.50"),
+    ("-1 - t", 2, "2 differentiations 4 constraints appear for 3 states (t = 0.50"),  # the middle
 ])
-def test_an_equation_that_is_there_twice_is_refused_with_what_it_leads_to(max_mu, said):
+def test_an_equation_that_is_there_twice_is_refused_with_what_it_leads_to(entry, max_mu, said):
     plant = plant_from_mapping({
         "name": "p", "states": ["a", "b", "c"], "E": np.diag([1, 0, 0]).tolist(),
-        "A": [[-1, 1, 1], [0, 1, 1], [0, 1, 1]], "initial_state": [1, 1, 1],
+        "A": [[entry, 1, 1], [0, 1, 1], [0, 1, 1]], "initial_state": [1, 1, 1],
     })
     with refused(said, by=ModelError):
         analyse(plant, 0.0, 1.0, max_mu=max_mu, rank_tol=1e-10)

@@ -13,26 +13,29 @@ from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
 from regressions import ETA, adjugate, fading, integrate, regression, three
-from scipy.integrate import cumulative_trapezoid, quad_vec, solve_ivp, trapezoid
+from scipy.integrate import cumulative_trapezoid, quad, quad_vec, solve_ivp, trapezoid
 
 import gpebo_cli
 from gpebo_cli import estimators, observers
+from gpebo_cli import run as api_run
 from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
+from gpebo_cli.estimators._mixed import energy_requirement
 from gpebo_cli.estimators._scalar import (
     _element_maps,
     kreisselmeier,
     lion,
     lion_rows,
     low_pass,
+    mix,
     scalar_law,
     scalar_path,
 )
 from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
-from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares
+from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares, one_over_memory
 from gpebo_cli.estimators.power import _resolved
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
@@ -1357,3 +1360,52 @@ def test_a_memory_that_begins_with_the_data_is_soon_resolved(monkeypatch, start)
     )
     assert found.details.estimation.requirement.holds
     assert 0 < len(rounds) < 60
+
+
+@pytest.mark.parametrize(("size", "fits"), [(1e150, True), (1e160, False)])
+def test_what_is_mixed_has_squares_that_are_numbers(size, fits):
+    mesh = initial_mesh(0.0, 1.0, [], 4, radau_rule(3))
+    extended = Trajectory(mesh, np.broadcast_to([[size, 3.0 * size]], (4, 4, 1, 2)))
+    if fits:
+        np.testing.assert_allclose(mix(extended, np.array([1.0])).quotient, 3.0, rtol=1e-15)
+    else:
+        with np.errstate(over="ignore"), pytest.raises(
+            SolverError, match=r"Δ² of Δ = det\(Ω\) is too large .* near t = 0;"
+        ):
+            mix(extended, np.array([1.0]))
+
+
+@pytest.mark.parametrize("beta", [0.0, 0.4])
+def test_the_pace_of_a_law_is_one_over_the_memory_of_its_data(beta):
+    t = np.array([0.5, 1.5, 4.0])
+    memory = [quad(lambda s, t=t: np.exp(-beta * (t - s)), 1.0, t)[0] for t in t[1:]]
+    found = one_over_memory(t, beta, 1.0)
+    np.testing.assert_allclose(found, [0.0, *np.reciprocal(memory)], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("paced", "text"), [
+    (False, "γ∫Δ² = 1 at the smallest gain 2; a fall to 1 % needs 4: γ ≥ 8"),
+    (True, "2 ∫Δ²/T = 1, T being the length of the memory; a fall to 1 % needs 4"),
+])
+def test_of_a_gain_that_memory_paces_no_other_one_is_told(paced, text):
+    found = energy_requirement(
+        np.array([[3.0, 2.0]]), 0.5, "IE", 4.0, "a fall to 1 %", paced=paced
+    )
+    assert (found.text, found.holds) == (text, False)
+
+
+def test_each_of_several_estimators_has_a_gain_of_its_own():
+    plant = one_state(A=[[-1]])
+
+    def gains(**settings):
+        found = api_run(plant, estimator={"name": "instrumental", "gamma": "auto", **settings},
+                        time={"horizon": 2.0})
+        return [case["gamma"] for case in found.cases]
+
+    assert gains(delay=[0.2, 0.4]) == pytest.approx([*gains(delay=0.2), *gains(delay=0.4)])
+
+
+def test_a_gain_that_no_data_ask_for_is_the_usual_one():
+    plant = one_state(A=[[-1]], C=[["max(0, t - 8)"]])
+    found = api_run(plant, estimator="drem", gamma="auto", time={"horizon": 3.0})
+    assert [case["gamma"] for case in found.cases] == [1e10]

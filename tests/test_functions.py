@@ -154,6 +154,7 @@ def test_a_plant_has_arrays_of_its_own():
     found = system.coefficients.taylor(np.zeros(1), 0)
     np.testing.assert_array_equal(found.A[0, 0], -np.eye(2))
     np.testing.assert_array_equal(found.C[0, 0], np.eye(2))
+    assert system.coefficients.zero == {"B", "D", "H", "phi", "u"}
     assert (system.theta, *system.initial_state) == (1.0, 1.0, 1.0)
 
 

@@ -469,6 +469,12 @@ def test_a_parameter_is_what_is_said_of_it_whatever_it_is_called(name):
     assert -1 / found.A[0, 0, 0, 0] == 0.25
 
 
+def test_voltages_that_are_saved_are_outputs_where_nothing_else_is_measured():
+    text = "t\nV1 a 0 {sin(t)}\nR1 a b 2\nC1 b 0 1\n.save v(b) i(R1)\n"
+    names = [plant_of(text, measure=measure)["outputs"] for measure in (None, "v(a)")]
+    assert names == [["y_b"], ["y_a"]]
+
+
 def test_what_continues_and_what_is_a_comment():
     text = "* a title\n* no\nC1 a 0 1 $ farad\nR1 a 0\n+ 5 ; ohms\n.save\n.end\nR1 a 0 2\n"
     netlist = read_netlist(text)
@@ -621,6 +627,21 @@ def test_a_hanging_pendulum_swings_by_the_force_of_its_rod():
     assert model == {
         "positions": ["x", "y"], "M": [["2", "0"], ["0", "2"]], "D": [["0", "0"], ["0", "0"]],
         "K": [["5", "0"], ["0", "5"]], "G": [["0", "-4"]],
+    }
+
+
+def test_drag_that_grows_with_speed_damps_by_the_speed_on_the_way():
+    """x'' + (x')² on a belt y = x with x₀ = t²/2: 2 x₀' δx', and the belt's force is not moved."""
+    t = sp.Symbol("t")
+    x, y = (sp.Function(name)(t) for name in "xy")
+    model = linearise(
+        [x.diff(t, 2) + x.diff(t) ** 2, y.diff(t, 2) * x], [y - x],
+        {x: t**2 / 2, y: t**2 / 2}, [t],
+    )
+    assert model == {
+        "positions": ["x", "y"],
+        "M": [["1", "0"], ["0", "t**2/2"]], "D": [["2*t", "0"], ["0", "0"]],
+        "K": [["0", "0"], ["1", "0"]], "G": [["-1", "1"]],
     }
 
 
@@ -1033,8 +1054,11 @@ def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr("gpebo_cli.model.archive.MAX_BYTES", 100_000)
     savemat(tmp_path / "bomb.mat", {"A": np.zeros((150, 150))}, do_compression=True)
     assert (tmp_path / "bomb.mat").stat().st_size < 1_000
-    head = "%%MatrixMarket matrix array real general\n1000000 1000000\n1\n"
+    head = "%%MatrixMarket matrix coordinate real general\n2 1000000 1\n1 1 1\n"
     (tmp_path / "A.mtx").write_text(head)
+    (tmp_path / "full").mkdir()
+    full = "%%MatrixMarket matrix array real general\n2000 2000\n1\n"
+    (tmp_path / "full" / "A.mtx").write_text(full)
     content = (tmp_path / "bomb.mat").read_bytes()
     savemat(tmp_path / "behind.mat", {"x": np.eye(2)})  # a bomb behind what is not packed
     (tmp_path / "behind.mat").write_bytes((tmp_path / "behind.mat").read_bytes() + content[128:])
@@ -1047,7 +1071,8 @@ def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):
     for path, message in (
         (tmp_path / "bomb.mat", "unpacks to more"), (tmp_path / "behind.mat", "unpacks to more"),
         (tmp_path / "cell.mat", "no matrix A"),
-        (tmp_path, f"has {len(head)} bytes with 1000000 × 1000000 entries; .* and 2000 rows and c"),
+        (tmp_path, f"has {len(head)} bytes with 2 × 1000000 entries; .* and 2000 rows and c"),
+        (tmp_path / "full", f"has {len(full)} bytes with 2000 × 2000 entries"),
     ):
         with pytest.raises(ConfigError, match=message):
             from_file(path, "p")

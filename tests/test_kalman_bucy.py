@@ -415,8 +415,10 @@ def test_the_table_does_not_ask_since_when_a_moving_parameter_is_known():
     assert not lines["w_x1"].rstrip().endswith("no")
 
 
-@pytest.mark.parametrize("level", ["given", "from the residual"])
-def test_a_recording_has_its_own_sample_times_and_noise(level):
+@pytest.mark.parametrize(("level", "samples"), [
+    ("given", 89), ("from the residual", 89), ("given", 9),  # few of them have long elements
+])
+def test_a_recording_has_its_own_sample_times_and_noise(level, samples):
     """A constant level, measured at uneven times: its deviation is that of the mean of the data."""
     plant = one_state(initial_state=[0])
     rng, sigma = np.random.default_rng(4), 0.3
@@ -426,16 +428,28 @@ def test_a_recording_has_its_own_sample_times_and_noise(level):
     noise = {"noise": {"name": "gaussian", "outputs": sigma}} if level == "given" else {}
     result = api_run(
         plant, observer={"name": "kalman_bucy", "P0": 1e4}, data=pd.DataFrame({"t": t, "y": y}),
-        time={"samples": 89}, **noise,
+        time={"samples": samples}, **noise,
     )
     # By information, 1/σ²h per second: the pause has as much as one sample.
     of_mean, estimation = sigma / np.sqrt(len(h)), result.details.estimation
-    first = estimation.states_std[0, 1, 0]  # after five samples
-    assert first == pytest.approx(sigma / np.sqrt(5), rel=1e-3 if level == "given" else 0.08)
-    assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.08)
+    first, rows = estimation.states_std[0, 1, 0], estimation.t[1] / 0.1
+    assert first == pytest.approx(sigma / np.sqrt(rows), rel=1e-3 if level == "given" else 0.08)
+    assert estimation.states_std[0, -1, 0] == pytest.approx(of_mean, rel=0.05)
     assert abs(result["x_hat"][0, -1] - 2.0) < 3 * of_mean
     told = "taken from the residual, 0.3" if level != "given" else "noise of the outputs"
     assert (told in result.verdict) == (level != "given")
+
+
+def test_a_recording_that_is_fitted_exactly_has_no_level_of_noise():
+    """Two rows, and three states to fit them with."""
+    plant = {
+        "name": "p", "states": ["x", "v", "w"], "outputs": ["y"], "E": np.eye(3).tolist(),
+        "A": [[0, 1, 0], [-1, -0.1, 1], [0, 0, -1]], "C": [[1, 0, 0]], "initial_state": [1, 0, 0],
+    }
+    data = pd.DataFrame({"t": [0.0, 1.0], "y": [1.0, 0.4]})
+    found = api_run(plant, observer="kalman_bucy", data=data, time={"samples": 3})
+    assert "noise of the outputs taken from" not in found.verdict
+    assert np.isnan(found.details.estimation.states_std).all()
 
 
 @pytest.mark.parametrize(("rate", "told"), [

@@ -8,6 +8,7 @@ from itertools import compress
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 from examples import gpebo
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from plants import one_state, shipped
 from processes import assert_refused, printed, refused, rows_of, write_table
 from random_systems import largest_error, random_system, run_system
+from units import Units, in_units
 
 from gpebo_cli import from_mechanics, from_netlist, run
 from gpebo_cli.evidence.knowledge import knowledge
@@ -343,6 +345,41 @@ def test_deviations_fall_by_the_mean_of_what_both_know():
     before = {"a": 4.0, "b": 1.0, "c": 0.0}
     assert _fall(before, {"a": 1.0, "b": 2.0, "c": 1.0}) == pytest.approx(2.0)
     assert _fall(before, {"c": 1.0}) == 1.0
+
+
+def test_what_sensors_are_worth_does_not_depend_on_units_of_states():
+    """Of states that are known without any output there is nothing to fall."""
+    plant = yaml.safe_load((CONF / "plant" / "circuit.yaml").read_text())
+    observer = {"name": "gpebo", "form": "strangeness_free"}
+    settings = Settings({"name": "ls_drem"}, TimeSettings(horizon=5.0), observer=observer)
+    one, states = np.ones(6), 10.0 ** np.array([6, 0, -6, 6, 0, -6])
+    other = in_units(plant, Units(states, one[:0], one[:1], one[:1], one, 1.0))
+    falls = [
+        {s.state: s.fall for s in candidates(settings, plant_from_mapping(each))}
+        for each in (plant, other)
+    ]
+    assert falls[1] == pytest.approx(falls[0], rel=1e-4)
+
+
+def test_a_sensor_of_a_state_that_is_zero_is_one_of_a_state_as_large_as_outputs():
+    plant = one_state(states=["x", "z"], E=[[1, 0], [0, 1]], A=[[-1, 1], [0, -2]], C=[[1, 0]],
+                      initial_state=[1, 0])
+    both = plant | {"outputs": ["y", "w"], "C": [[1, 0], [0, 1]]}
+    observer = {"name": "gpebo", "form": "strangeness_free"}
+    settings = Settings({"name": "ls_drem"}, TimeSettings(horizon=3.0), observer=observer)
+    alone, more = (examine(settings, plant_from_mapping(p)).deviations for p in (plant, both))
+    (best, *_) = candidates(settings, plant_from_mapping(plant))
+    falls = [np.log(alone[k] / more[k]) for k in alone]
+    assert (best.state, best.fall) == ("z", pytest.approx(np.exp(np.mean(falls)), rel=1e-2))
+
+
+def test_deviations_for_noise_of_one_are_by_the_rows_of_a_recording():
+    """A constant that is measured 20 times, each row held up to the next one."""
+    t = np.arange(21.0)
+    data = DataSettings("csv", frame=pd.DataFrame({"t": t, "y": np.ones(21)}), hold="zoh")
+    settings = Settings({"name": "drem"}, TimeSettings(-np.inf, np.inf, 11), data=data)
+    found = examine(settings, plant_from_mapping(one_state())).deviations
+    assert found["x"] == pytest.approx(1.0 / np.sqrt(20.0), rel=1e-3)
 
 
 @pytest.mark.parametrize(("plant_name", "count"), [("descriptor", 3), ("circuit", 2)])

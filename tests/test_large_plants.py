@@ -961,23 +961,77 @@ def test_series_of_coefficients_with_poles_or_that_swing(rate, logarithm, elemen
 
 
 @pytest.mark.parametrize("swing", [0.0, 0.5])
-@pytest.mark.parametrize(("rate", "most"), [(3.0, 6.0), (-3.0, 1.15)])
-def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, most, swing):
-    """sin 20t, of which errors grow or are forgotten; what series leave out comes beside them."""
+@pytest.mark.parametrize(("rate", "most", "late"), [
+    (3.0, 6.0, 0.0), (-3.0, 1.15, 0.0), (3.0, 3.0, 1e8), (-3.0, 2.0, 1e8),
+])
+def test_errors_of_series_are_those_of_collocation_on_the_same_elements(rate, most, late, swing):
+    """sin 20t, of which errors grow or are forgotten; what series leave out comes beside them.
+
+    Late it is rounding of times, by random signs; polynomials leave out less than that.
+    """
     def coefficients(t, inside):
+        t = t - late
         rates = rate * (1.0 + swing * np.cos(t if swing else np.zeros(1)))
         f = 20.0 * np.cos(20.0 * t) - rates * np.sin(20.0 * t)
         A, f = rates[:, None, None] * np.eye(9), f[:, None, None] * np.ones((9, 1))
         return LinearEquation(None, A, f)
 
-    one = np.ones((9, 1))
+    one, rule = np.ones((9, 1)), radau_rule(10 if late else 6)
     problem = LinearProblem(coefficients, 0.0 * one, name="sines", units=one)
-    limits = {"tol": 1e-3, "max_elements": 500}
-    found = series.solve_dense(problem, initial_mesh(0.0, 2.0, [], 20, radau_rule(6)), **limits)
+    limits = {"tol": 1e-6 if late else 1e-3, "max_elements": 500}
+    found = series.solve_dense(problem, initial_mesh(late, late + 2.0, [], 20, rule), **limits)
     other = solve(problem, found.trajectory.mesh, **limits)
     assert other.trajectory.mesh.size == found.trajectory.mesh.size
+    beside = replace(problem, start=np.zeros((9, 6)))  # other columns are zero
+    many = series.solve_dense(beside, found.trajectory.mesh, **limits).errors[:, 0]
+    np.testing.assert_allclose(many, found.errors[:, 0], rtol=1e-6)
     ratio = found.errors / other.errors
-    assert 1.0 < ratio.min() <= ratio.max() < most
+    assert (0.25 if late else 1.0) < ratio.min() <= ratio.max() < most
+
+
+def test_series_that_end_where_a_component_is_lost_lose_it_there():
+    """From e^−5t rounding grows with e^5t, and is larger than what the state ever was."""
+    A = np.kron(np.eye(5), [[0.0, 5.0], [5.0, 0.0]])[None]
+    start = np.tile([[1.0], [-1.0]], (5, 1))
+    problem = LinearProblem(lambda t, inside: LinearEquation(None, A, 0.0 * A[..., :1]), start)
+
+    def lost(horizon):
+        mesh = initial_mesh(0.0, horizon, [], int(10 * horizon), radau_rule(9))
+        return series.solve_dense(problem, mesh, tol=1e-12, max_elements=200).lost
+
+    first = lost(10.0)
+    assert 5.0 < first < 8.0
+    assert lost(first) == pytest.approx(first)
+    assert lost(first - 0.1) is None
+
+
+def test_errors_of_series_see_noise_that_no_mesh_resolves():
+    """x' = cos t + 1e-6 sin 1e9t: coefficients of the polynomials do not fall."""
+    def coefficients(t, inside):
+        f = np.cos(t) + 1e-6 * np.sin(1e9 * t)
+        return LinearEquation(None, np.zeros((1, 9, 9)), f[:, None, None] * np.ones((9, 1)))
+
+    problem = LinearProblem(coefficients, np.zeros((9, 1)), name="noise", units=np.ones((9, 1)))
+    mesh = initial_mesh(0.0, 2.0, [], 20, radau_rule(10))
+    found = series.solve_dense(problem, mesh, tol=1e-8, max_elements=20)
+    error = np.abs(found.trajectory.values[:, :, 0, 0] - np.sin(mesh.points)).max()
+    assert 1e-8 < error < 5.0 * found.errors[0, 0]
+
+
+def test_rounding_adds_up_in_stiff_elements_as_in_collocation():
+    """What swings forgets no rounding of right ends, and polynomials leave nothing out."""
+    A, one = np.kron(np.eye(5), [[0.0, 1.0], [-1.0, 0.0]])[None], np.ones((10, 1))
+    f, limits = np.zeros((1, 10, 1)), {"tol": 1e-10, "max_elements": 200}
+    problem = LinearProblem(
+        lambda t, inside: LinearEquation(None, A, f), one, name="turns", units=one
+    )
+    mesh = initial_mesh(0.0, 200.0, [], 200, radau_rule(14))
+    found, other = series.solve(
+        problem, lambda mesh: (taylor.by_entries(A), f, ()), mesh,
+        units=np.ones(10), stiff=True, **limits,
+    ), solve(problem, mesh, **limits)
+    ratio = found.errors / other.errors
+    assert 0.8 < ratio.min() <= ratio.max() < 2.0
 
 
 def test_units_of_many_states_are_those_of_full_equations(monkeypatch):

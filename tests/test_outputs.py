@@ -18,7 +18,7 @@ import pytest
 from factories import STATES, make_result, with_figures, without_observer
 from processes import read_table, refused
 
-from gpebo_cli.errors import ConfigError, GpeboError
+from gpebo_cli.errors import ConfigError, GpeboError, printable
 from gpebo_cli.experiment.result import (
     ActiveBound,
     EstimationResult,
@@ -30,6 +30,7 @@ from gpebo_cli.results import files, tables
 from gpebo_cli.results.finished import span
 from gpebo_cli.results.folder import write_run
 from gpebo_cli.results.provenance import GitState, Provenance, git_state, provenance
+from gpebo_cli.results.report import columns
 from gpebo_cli.results.summary import strict, summary_text
 
 TABLES = [f"{name}.csv" for name in tables.TABLES]
@@ -454,3 +455,13 @@ def test_what_is_no_signals_has_no_span(content, tmp_path):
     (tmp_path / "signals.csv").write_text(content, encoding="utf-8")
     with refused("signals.csv: not the signals of a run", by=GpeboError):
         span(tmp_path)
+
+
+def test_columns_of_a_table_are_as_wide_as_their_longest_cells():
+    rows = [["gamma", "x"], ["1", "-12.5"]]
+    assert columns(rows) == ["gamma      x", "    1  -12.5"]
+    assert columns(rows, str.ljust) == ["gamma  x    ", "1      -12.5"]
+
+
+def test_what_would_command_a_terminal_is_written_and_a_backslash_is_one():
+    assert printable("C:\\a\x1b[2J ü\n") == "C:\\a\\x1b[2J ü\\n"

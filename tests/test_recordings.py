@@ -37,6 +37,7 @@ from gpebo_cli.recordings.hold import bends, edges, held, recording_mesh
 from gpebo_cli.recordings.lines import DATE, LineReader, seconds
 from gpebo_cli.recordings.load import load
 from gpebo_cli.recordings.table import read_table
+from gpebo_cli.results.finished import read_columns, read_errors, read_run
 from gpebo_cli.settings import DataSettings, Settings, TimeSettings
 
 WHOLE = TimeSettings(-np.inf, np.inf, 201)
@@ -273,6 +274,25 @@ def test_so_it_may_in_a_stream():
     np.testing.assert_allclose(made.parameters[0, -1, :2], [2.5, 0.4], atol=1e-11)
     *of_psi, of_Y = np.linalg.norm(made.regression.weighted(), axis=(0, 1))
     np.testing.assert_allclose(online.natural_sizes * of_psi, of_Y, rtol=1e-9)
+
+
+def test_of_states_that_nobody_measured_there_are_no_errors_to_be_compared(tmp_path):
+    t = np.linspace(0.0, 3.0, 31)
+    plant = one_state(states=["x", "v"], E=[[1, 0], [0, 1]], A=[[0, 1], [-1, 0]], C=[[1, 0]],
+                      initial_state=[1, 0])
+    data = {"t": t, "y": np.cos(t), "x": np.cos(t)}
+    run(plant, data=data, time={"samples": 31}).save(tmp_path, figures=False)
+    (found,) = read_errors(read_run("r", tmp_path, {}))
+    x = read_columns(tmp_path / "estimates.csv")["x_hat"]
+    np.testing.assert_allclose(found.states, np.abs(x - np.cos(found.t)), atol=1e-9)
+
+
+@pytest.mark.parametrize(("hold", "between"), [("zoh", 2.5), ("linear", 2.5), ("cubic", 2.25)])
+def test_true_states_between_rows_are_splines_where_outputs_are(hold, between):
+    t = np.arange(5.0)
+    data = DataSettings("csv", frame=pd.DataFrame({"t": t, "y": t, "x": t**2}), hold=hold)
+    found = load(plant_from_mapping(one_state()), data, WHOLE, 1e-9).states(np.array([1.5]))
+    np.testing.assert_allclose(found, [[between]], rtol=1e-12)
 
 
 def test_elements_end_where_one_of_the_signals_bends():
@@ -861,6 +881,11 @@ def test_of_columns_with_the_unit_the_most_similar_name_is_taken(tmp_path):
         found = guess(str(path), system)
         assert found.columns == {"t": "t", "v_in": "Vin (V)", "v_out": "Vout (V)"}
         assert found.reasons["v_in"] == "its unit, as of others: LOOK AT IT"
+    path.write_text("t,v_in,Vout (V),Vaux (V)\n0,1,2,3\n1,2,3,4\n")
+    assert guess(str(path), system).reasons["v_in"] == "the same name"
+    path.write_text("t,a,v_inp,voltage_out\n0,1,2,3\n1,2,3,4\n")
+    found = guess(str(path), plant_from_mapping(plant))
+    assert (found.columns["v_in"], found.reasons["v_in"]) == ("v_inp", "a similar name")
 
 
 def test_an_output_called_T_is_no_time(tmp_path):

@@ -209,6 +209,8 @@ CIRCUIT = "* divider\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n.end\n"
          "x.yaml: only `# @package _global_` is allowed, got 'plant'"),
         (["run", "experiment=x"], {"experiment/x.yaml":
          "# @package _global_\nhydra: {sweeper: {params: {+a: 1}}}\n"}, "'+a=1' cannot be swept"),
+        (["run", "experiment=x"], {"experiment/x.yaml":
+         "# @package _global_\nhydra: {sweeper: {params: 3}}\n"}, "'3=' cannot be swept"),
     ],
 )
 def test_of_commands(words, files, message, tmp_path):

@@ -201,6 +201,7 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
     ({"Y": ["u", "u"]}, "Y has 2 entries and psi has 1 rows"),
     ({"Y": ["lp(u)"]}, "lp takes two arguments, not 1"),
     ({"Y": ["lp(u, u)"]}, "its rate λ must be a positive number"),
+    ({"Y": ["lp(u, u**3)"]}, "its rate λ must be a positive number"),
     ({"Y": ["delay(u, -1)"]}, "the delay must be a positive number"),
     ({"Y": ["lp(d(t*t), 1)"]}, "d(.) cannot stand inside"),
     ({"Y": ["a*u"]}, "a is an unknown and cannot be used here"),

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from examples import gpebo
-from plants import experiment, shipped
+from plants import experiment, one_state, shipped
 from processes import assert_refused, begin, process, python, refused
 from scipy.integrate import solve_ivp
 from test_estimators import FROM_ZERO
@@ -682,6 +682,17 @@ def test_the_monotone_law_at_samples(gain):
 
 
 NOT_ALONG_RESETS = ["exciting", "instrumental", "annihilator", "monotone"]
+
+
+def test_what_the_last_sample_determines_is_told():
+    """x and v by two samples of x that are held up to a third one."""
+    plant = one_state(states=["x", "v"], E=[[1, 0], [0, 1]], A=[[0, 1], [-1, 0]], C=[[1, 0]])
+    found = gpebo_cli.run(
+        plant | {"initial_state": [1, 0.5]}, estimator="least_squares",
+        observer={"sample_time": 1.0}, time={"horizon": 2.0},
+    )
+    assert np.isfinite(list(found.estimates.values())).all()
+    assert found.parameters == pytest.approx({"e0_x": -1.0, "e0_v": -0.5}, abs=0.01)
 
 
 def test_the_power_law_at_samples_needs_what_its_start_is_off():

@@ -399,7 +399,9 @@ def test_a_jump_that_is_large_hides_no_impulse_beside_it(size):
     np.testing.assert_allclose(jump.impulses, [[0, 0, 1, 0]], atol=1e-12)
 
 
-@pytest.mark.parametrize(("seed", "slow"), [(59, 3), (117, 3), (70, 4), (105, 5), (122, 7)])
+@pytest.mark.parametrize(("seed", "slow"), [
+    (5, 3), (8, 3), (59, 3), (117, 3), (70, 4), (105, 5), (122, 7),
+])
 def test_what_constraints_make_zero_has_no_impulse(seed, slow):
     """N x' = x is zero; mixed with other states, in all equations, it is their rounding."""
     rng, n = np.random.default_rng(seed), slow + 2

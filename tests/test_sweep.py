@@ -546,6 +546,7 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     assert [panel.legend for panel in panels] == [True, *[False] * (len(METRICS) - 1)]
     assert [curve.label for curve in panels[0].curves] == ["drem", "mre"]
     assert [_is_axis([*quiet, case("a", g, 1.0)], "gamma") for g in (0.5, 0.0)] == [True, False]
+    assert _is_axis([*quiet, Case("b", Path("b"), 0, {"plant": "p"}, {})], "gamma")
 
 
 def test_a_label_is_the_shortest_one_that_tells_a_case_from_the_others():

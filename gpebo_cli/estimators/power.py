@@ -156,7 +156,7 @@ class PowerEstimates(MixedEstimates):
     ) -> Array:
         """η̂ (n,) of n laws at the end of an element, from its start; at the times t in ``out``."""
         left, length = path.mesh.edges[k], path.mesh.steps[k]
-        places, eta = (t - left) / length, eta.copy()
+        places = (t - left) / length
         at, step = np.zeros(len(eta)), np.full(len(eta), 0.25)  # shares of the element
         while (lanes := np.flatnonzero(at < 1.0)).size:
             begin = at[lanes]

@@ -101,7 +101,6 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         SolverError: S cannot be resolved.
     """
     basis, dual, units = reduced.basis, reduced.first.split.dual, reduced.units
-    weight = float(np.square(reduced.first.output_scale * reduced.form.units.outputs).max())
     n = basis.shape[1]
 
     A_0 = reduced.first.at_first.dynamics[0] * units / units[:, None]
@@ -117,7 +116,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
         Q = _SHARE * inside @ (A_0 @ transpose(A_0) + size * np.eye(n)) @ transpose(inside)
         return StateSpace(
             A=o.dynamics, b=np.zeros((1, n, 0)), c=c, z=np.zeros((1, rows, 0)), Q=Q,
-            N=np.zeros((1, n, rows)), V=weight * np.eye(rows)[None],
+            N=np.zeros((1, n, rows)), V=np.eye(rows)[None],
         ), ()
 
     parts = filter_windows(
@@ -129,7 +128,7 @@ def riccati_injection(reduced: ReducedSystem) -> tuple[Injection, Mesh]:
     S = joined([_covariance(part, reduced.mesh.rule) for part in parts])
 
     def gain(o: ObserverMatrices, t: Array, inside: Array) -> Array:
-        weighted = dual @ o.split.projector @ basis @ S(t, inside) / weight
+        weighted = dual @ o.split.projector @ basis @ S(t, inside)
         return np.asarray(weighted @ transpose(o.algebraic @ basis) @ o.residual)
 
     return gain, S.mesh
