@@ -25,7 +25,7 @@ run: $(VENV)/installed
 	@echo 'next: . $(BIN)/activate; gpebo list'
 
 test: $(VENV)/installed-dev
-	$(BIN)/pytest -n auto
+	PYTHONDONTWRITEBYTECODE= $(BIN)/pytest -n auto
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check
