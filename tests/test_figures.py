@@ -153,7 +153,7 @@ def visible_texts(figure: Figure) -> list[Text]:
 SEEN: dict[str, list[str]] = {
     "one case": ["state_error_a", "delta"], "many gains": ["parameter_error", "error_norms"],
     "long names": ["states", "estimates", "state_error"], "no units": ["signals", "estimates_a"],
-    **dict.fromkeys(("microseconds", "days", "late"), ["states", "gram"]),
+    **{times: ["states", "gram"] for times in ("microseconds", "days", "late")},
     "not excited": ["regressor", "gram", "delta"], "rotating kernel": ["estimates", "state_error"],
     "wild": ["estimates_a", "parameter_error", "state_error_a"],
     "diverging": ["estimates_a", "state_error_a", "state_error_b"],
