@@ -428,7 +428,7 @@ def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
 
 def test_what_follows_an_input_far_below_the_noise_is_told_and_white_noise_does_not():
     rng = np.random.default_rng(0)
-    white = rng.standard_normal((300, 10_000, 2))
+    white = rng.standard_normal((100, 10_000, 2))
     fast = np.sin(0.4 * np.arange(10_000))
     inputs = np.stack([fast, np.ones(10_000), rng.standard_normal(10_000)], axis=1)
     late = 0.1 * np.roll(fast, 7)[:, None]
