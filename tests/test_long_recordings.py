@@ -635,7 +635,7 @@ def test_a_row_more_takes_few_more_bytes(remedy, name, limits, monkeypatch):
     monkeypatch.setattr(gpebo, "_LONG", 32)
     plant, observer = shipped("motor"), build({"name": "gpebo", "remedy": remedy})
     law, found, t = estimators.build({"name": name}), [], np.linspace(0.0, 0.1, 21)
-    for rows in (40, 200, 1000):  # the first ones fill caches
+    for rows in (40, 200, 500):  # the first ones fill caches
         signals = rough(plant, "linear", rows, 0.1)
         signals = replace(signals, wanted=t, asked=np.union1d(signals.mesh.edges, t))
         tracemalloc.start()

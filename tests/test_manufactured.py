@@ -14,7 +14,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
-t = sp.Symbol("t")
+t = sp.Symbol("t", real=True)  # of which less is asked
 
 
 def triangular(n, rng, density, varying, lower):
