@@ -886,5 +886,5 @@ def test_the_unit_of_time_does_not_change_why_a_solution_ends():
 
 def test_a_transistor_that_is_almost_off_acts_all_the_same():
     """Its small currents are derivatives and no rounding: without them Newton's method fails."""
-    result = run("published/transistor", observer="none", time={"horizon": 0.02, "samples": 11})
+    result = run("published/transistor", observer="none", time={"horizon": 0.05, "samples": 11})
     assert result.details.simulation.error_estimate < 1e-7
