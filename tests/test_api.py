@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import io
 import itertools
-import os
 import sys
 import time
 from html import escape
 from types import SimpleNamespace
 
+import inprocess
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -18,7 +18,7 @@ import yaml
 from examples import ROOT, assert_repeats, gpebo
 from omegaconf import OmegaConf
 from plants import DECAYING, one_state, shipped
-from processes import assert_refused, install, printed, process, python, refused
+from processes import assert_refused, install, printed, python, refused
 
 import gpebo_cli
 from gpebo_cli import (
@@ -452,7 +452,7 @@ def test_an_estimator_of_ones_own(tmp_path):
             run("descriptor", estimator=wrong)
 
 
-def test_an_estimator_of_another_package(tmp_path):
+def test_an_estimator_of_another_package(tmp_path, monkeypatch):
     """What `pip install` leaves of a package with an entry point, and a file with its settings."""
     entries = {"ridge": "Ridge", "broken": "Gone", "odd": "RIDGE"}
     install(tmp_path, "theirs", "gpebo.estimators", **entries)
@@ -461,10 +461,12 @@ def test_an_estimator_of_another_package(tmp_path):
     for name in ("ridge", "broken", "odd"):
         (tmp_path / "estimator" / f"{name}.yaml").write_text(f"name: {name}\n")
 
+    monkeypatch.syspath_prepend(tmp_path)
+
     def command(*words):
-        return process(
+        return inprocess.gpebo(
             "run", "--config-dir", ".", "plant=descriptor", "figures=none", "hydra.run.dir=out",
-            *words, cwd=tmp_path, PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}",
+            *words, cwd=tmp_path,
         )
 
     assert printed(command("estimator=ridge", "+estimator.f=1e-6")).split()[0] == "f"

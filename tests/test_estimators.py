@@ -236,7 +236,8 @@ def means_ode(gamma, delay, settle, rows):
 )
 def test_against_an_integration_of_the_defining_odes(name, gains, ode, tolerance):
     f, x0, columns = ode
-    t = T[:41] if name in ("power", "exciting") else T  # DOP853's steps get tiny later
+    tiny = name in ("power", "exciting") or (name, gains.get("gamma")) == ("drem", 1e4)
+    t = T[:41] if tiny else T  # DOP853's steps get tiny later
     cut = 10 if "delay" in gains else 40  # f jumps at t[10] = 1
     first = integrate(f, x0, t[: cut + 1])
     rest = integrate(f, first[-1], t[cut:])[1:] if t[cut:][1:].size else first[:0]

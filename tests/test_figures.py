@@ -14,7 +14,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from factories import UNITS, make_result, with_figures, without_observer
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 from matplotlib.mathtext import MathTextParser
@@ -149,10 +149,21 @@ def visible_texts(figure: Figure) -> list[Text]:
     ]
 
 
+# Of results that differ from the circuit's in one thing only, the figures in which it is seen.
+SEEN: dict[str, list[str]] = {
+    "one case": ["state_error_a", "delta"], "many gains": ["parameter_error", "error_norms"],
+    "long names": ["states", "estimates", "state_error"], "no units": ["signals", "estimates_a"],
+    **{times: ["states", "gram"] for times in ("microseconds", "days", "late")},
+    "not excited": ["regressor", "gram", "delta"], "rotating kernel": ["estimates", "state_error"],
+    "wild": ["estimates_a", "parameter_error", "state_error_a"],
+    "diverging": ["estimates_a", "state_error_a", "state_error_b"],
+}
+
+
 @pytest.mark.parametrize("kind", RESULTS)
 def test_layout(kind: str) -> None:
     """Every axis is named; legends and texts keep clear of curves, each other and the edge."""
-    for name, figure in draw(RESULTS[kind]()):
+    for name, figure in draw(RESULTS[kind](), SEEN.get(kind)):
         page = figure.bbox
         renderer = rendered(figure).get_renderer()
         boxes = [axes.get_window_extent() for axes in figure.axes]
@@ -186,11 +197,12 @@ def test_layout(kind: str) -> None:
 
 
 def test_the_circuit_has_the_figures_of_the_paper() -> None:
-    assert {name for name, _ in draw(make_result(samples=51))} == CIRCUIT_FIGURES
+    assert set(describe(make_result(samples=51))) == CIRCUIT_FIGURES
 
 
 def test_axes_carry_the_units_of_their_signals() -> None:
-    figures = dict(draw(make_result(samples=51)))
+    drawn = ["states", "estimates_a", "estimates_b", "parameter_error", "state_error_a"]
+    figures = dict(draw(make_result(samples=51), drawn))
     labels = {name: [axes.get_ylabel() for axes in fig.axes] for name, fig in figures.items()}
     assert labels["states"] == ["states (V)", "states (A)"]
     [(_, one_curve_each)] = draw(make_result(samples=51), ["signals"])
@@ -215,13 +227,14 @@ def test_mathematics_is_broken_at_a_minus_sign_or_not_at_all() -> None:
         result, system=replace(result.system, states=names, units=dict.fromkeys(names, "g/l")),
         estimation=replace(estimation_of(result), names=parameters),
     )
-    for name, figure in draw(long):
+    broken = False
+    for name, figure in draw(long, ["estimates_a", "parameter_error", "state_error_b"]):
         rendered(figure)  # raises for mathematics that is none
         for axes in figure.axes:
             lines = axes.get_ylabel().split("\n")
             assert all(line.count("$") % 2 == 0 for line in lines), name
-    assert any("$\n$- " in axes.get_ylabel() for _, figure in draw(long)
-               for axes in figure.axes)
+            broken |= "$\n$- " in axes.get_ylabel()
+    assert broken
 
 
 def test_time_axis_of_other_scales() -> None:
@@ -252,19 +265,19 @@ def test_power_of_ten_stands_with_the_unit() -> None:
 
 def test_without_an_observer_there_are_states_and_signals() -> None:
     result = without_observer(make_result(samples=51))
-    assert {name for name, _ in draw(result)} == {"states", "signals"}
+    assert set(describe(result)) == {"states", "signals"}
     with pytest.raises(ConfigError, match=r"nothing for gram, delta; it has signals, states$"):
         draw(result, ["gram", "delta"])
 
 
 def test_rotating_kernel_does_not_divide_the_states() -> None:
-    names = {name for name, _ in draw(RESULTS["rotating kernel"]())}
+    names = set(describe(RESULTS["rotating kernel"]()))
     assert {"estimates", "state_error"} <= names
     assert not {"estimates_a", "estimates_b", "state_error_a", "state_error_b"} & names
 
 
 def test_without_mixing_there_is_no_delta() -> None:
-    assert "delta" not in dict(draw(make_result(samples=51, mixing=False)))
+    assert "delta" not in describe(make_result(samples=51, mixing=False))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -397,7 +410,7 @@ def test_figures_are_as_wide_as_asked_for(width: float, inches: float) -> None:
     result = make_result(samples=11)
     output = replace(result.settings.output, width=width, dpi=100)
     result = replace(result, settings=replace(result.settings, output=output))
-    for _, figure in draw(result):
+    for _, figure in draw(result, ["states", "gram"]):
         assert figure.get_figwidth() == pytest.approx(inches)
 
 
@@ -628,6 +641,7 @@ def test_a_power_of_ten_stands_beside_numbers_that_are_large_or_small(
     assert [power for power in range(-9, 10) if style.power_of_ten(power) in text] == powers
 
 
+@settings(max_examples=30)
 @given(st.floats(-1e6, 1e6, allow_subnormal=False), st.floats(1e-3, 1e6, allow_subnormal=False))
 def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float) -> None:
     t = np.array([0.0, 1.0])
@@ -642,6 +656,7 @@ def test_linear_ticks_are_few_inside_and_distinct(low: float, span: float) -> No
         assert any(label[-1] != "0" for label in labels), "no more decimals than tell them apart"
 
 
+@settings(max_examples=30)
 @given(st.integers(-320, 300), st.integers(1, 600))
 def test_log_ticks_are_few(low: int, span: int) -> None:
     ends = np.array([10.0**low, 10.0 ** min(low + span, 300)])

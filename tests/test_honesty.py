@@ -25,7 +25,7 @@ from gpebo_cli.simulation.simulate import simulate
 GROWS = "grows|is not finite|may grow"
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(
     st.sampled_from(["smooth", "sharp", "scaled", "growing"]),
     st.integers(0, 2**32 - 1),
@@ -57,7 +57,7 @@ def test_rounding_of_constraints_counts_where_states_swing_by_themselves():
     assert found.ratio < 3.0
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(st.floats(4.0, 12.0), st.floats(0.5, 5.0))
 def test_what_a_fast_mode_forgets_is_no_error(decades, omega):
     """x' = -λ (x - sin ωt) + ω cos ωt beside a slow state: the estimate was λ h roundings and more.
@@ -80,7 +80,7 @@ def test_what_a_fast_mode_forgets_is_no_error(decades, omega):
     assert (found.state_errors < 5e-13).all()
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(st.integers(0, 2**32 - 1), st.floats(4.0, 9.0))
 def test_rounding_of_constraints_beside_a_fast_mode_is_seen_and_not_bounded(seed, decades):
     """Index 1: a tenth of the estimates were more than 3,000 times the error, some 1e9 times."""
@@ -222,7 +222,7 @@ def scalar(rate, start=1.0, forcing="0"):
     })
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(st.floats(2.0, 8.0), st.floats(1.0, 40.0))
 def test_growth_is_resolved_or_refused(decades, horizon):
     """x' = −λ cos(t) (x − sin t) + cos t from x(0) = 1: e^{−λ sin t} beside sin t."""
@@ -294,7 +294,7 @@ def test_phase_errors_add_up(omega):
     assert error < 1e-14 * omega * 20 * 5
 
 
-@settings(deadline=None, max_examples=10)
+@settings(deadline=None, max_examples=6)
 @given(st.floats(-12.0, 12.0), st.sampled_from(["0.05", "0.3"]))
 def test_a_small_state_counts_for_itself(decades, width):
     """A sharp state in other units beside a smooth one has the error that its estimate says."""

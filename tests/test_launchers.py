@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
+from examples import gpebo as one_by_one
 from processes import assert_refused, begin, python, wait_for
 from processes import process as gpebo
 from test_sweep import FAST, rows, without_seconds
@@ -58,7 +59,7 @@ def options(launcher, shared):
 @pytest.fixture(scope="module")
 def basic(tmp_path_factory):
     folder = tmp_path_factory.mktemp("basic")
-    gpebo(*WORDS, "hydra.sweep.dir=sweep", cwd=folder)
+    one_by_one(*WORDS, "hydra.sweep.dir=sweep", cwd=folder)
     return folder / "sweep"
 
 
@@ -95,9 +96,9 @@ def test_every_launcher_makes_the_same_table(tmp_path, basic, launcher):
 def test_a_worker_that_dies_leaves_a_sweep_that_can_be_resumed(tmp_path):
     if reason := why_not("joblib"):
         pytest.skip(reason)
-    many = ["run", "-m", "estimator.gamma=logspace(6,9,12)", *FAST]
-    words = [*many, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
-    with begin(*words, "hydra.sweep.dir=sweep", cwd=tmp_path) as process:
+    many = ["run", "-m", "estimator.gamma=logspace(6,9,8)", *FAST]
+    words = [*many, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=sweep"]
+    with begin(*words, cwd=tmp_path) as process:
         wait_for(tmp_path / "sweep", "*/result.json", 1)
         for worker in workers(process.pid):
             os.kill(worker, signal.SIGKILL)
@@ -113,9 +114,9 @@ def test_a_worker_that_dies_leaves_a_sweep_that_can_be_resumed(tmp_path):
     assert statuses.count("done") >= 1
     assert statuses.count("missing") >= 1
 
-    assert gpebo(*words, "resume=sweep", cwd=tmp_path).returncode == 0
+    assert one_by_one(*many, "resume=sweep", cwd=tmp_path).returncode == 0
     whole = tmp_path / "whole"
-    assert gpebo(*words, f"hydra.sweep.dir={whole}", cwd=tmp_path).returncode == 0
+    assert one_by_one(*many, f"hydra.sweep.dir={whole}", cwd=tmp_path).returncode == 0
     assert without_seconds(tmp_path / "sweep") == without_seconds(whole)
 
 

@@ -428,7 +428,7 @@ def test_a_slow_misfit_far_below_the_noise_is_told_and_white_noise_is_not():
 
 def test_what_follows_an_input_far_below_the_noise_is_told_and_white_noise_does_not():
     rng = np.random.default_rng(0)
-    white = rng.standard_normal((300, 10_000, 2))
+    white = rng.standard_normal((100, 10_000, 2))
     fast = np.sin(0.4 * np.arange(10_000))
     inputs = np.stack([fast, np.ones(10_000), rng.standard_normal(10_000)], axis=1)
     late = 0.1 * np.roll(fast, 7)[:, None]
@@ -635,7 +635,7 @@ def test_a_row_more_takes_few_more_bytes(remedy, name, limits, monkeypatch):
     monkeypatch.setattr(gpebo, "_LONG", 32)
     plant, observer = shipped("motor"), build({"name": "gpebo", "remedy": remedy})
     law, found, t = estimators.build({"name": name}), [], np.linspace(0.0, 0.1, 21)
-    for rows in (40, 200, 1000):  # the first ones fill caches
+    for rows in (40, 200, 500):  # the first ones fill caches
         signals = rough(plant, "linear", rows, 0.1)
         signals = replace(signals, wanted=t, asked=np.union1d(signals.mesh.edges, t))
         tracemalloc.start()

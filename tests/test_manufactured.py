@@ -14,7 +14,7 @@ from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate
 
-t = sp.Symbol("t")
+t = sp.Symbol("t", real=True)  # of which less is asked
 
 
 def triangular(n, rng, density, varying, lower):
@@ -77,10 +77,10 @@ def simulated(plant, exact):
     [
         (4, 2, [2], True, 2),
         (6, 2, [3, 1], True, 2),
-        (8, 3, [4, 1], True, 2),
-        (8, 3, [4, 1], False, 2),
-        (12, 4, [4, 2, 2], True, 2),
-        (33, 20, [4, 4, 3, 2], False, 1),
+        (8, 3, [4, 1], True, 1),
+        (8, 3, [4, 1], False, 1),
+        (12, 4, [4, 2, 2], True, 1),
+        (17, 8, [4, 3, 2], False, 1),
     ],
 )
 def test_manufactured_solution_is_found(n, d, blocks, varying, seeds):

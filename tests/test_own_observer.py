@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 
-from processes import assert_refused, install, printed, process
+from inprocess import gpebo
+from processes import assert_refused, install, printed
 
 ROOT = Path(__file__).parent.parent
 PLANT = """
@@ -24,7 +24,7 @@ initial_state: [1, 0]
 """
 
 
-def test_an_observer_of_another_package(tmp_path):
+def test_an_observer_of_another_package(tmp_path, monkeypatch):
     page = (ROOT / "docs" / "howto" / "observer.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "mine.py").write_text(code, encoding="utf-8")
@@ -34,11 +34,12 @@ def test_an_observer_of_another_package(tmp_path):
         (tmp_path / group).mkdir()
         (tmp_path / group / f"{name}.yaml").write_text(text)
 
+    monkeypatch.syspath_prepend(tmp_path)
+
     def command(*words):
-        return process(
+        return gpebo(
             "run", "--config-dir", ".", "plant=oscillator", "observer=open_loop",
-            "estimator=ls_drem", "figures=none", "hydra.run.dir=out", *words,
-            cwd=tmp_path, PYTHONPATH=f"{ROOT}{os.pathsep}{tmp_path}",
+            "estimator=ls_drem", "figures=none", "hydra.run.dir=out", *words, cwd=tmp_path,
         )
 
     error = re.search(r"state error (\S+) at the end", printed(command()))

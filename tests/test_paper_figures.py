@@ -114,7 +114,7 @@ def test_estimators_are_overlaid(written: Path) -> None:
 def test_a_second_time_every_byte_is_the_same(
     written: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    names = ["paper_circuit", "paper_canonical"]
+    names = ["paper_circuit"]
     assert figures.main([*names, "--output", str(tmp_path)]) == 0
     said = capsys.readouterr()
     counts = [f"{name}: {len(stems(tmp_path / name, 'png'))} figures" for name in names]
@@ -429,7 +429,7 @@ def test_the_tables_hold_for_another_method(monkeypatch: pytest.MonkeyPatch) -> 
         return replace(built, solver=replace(built.solver, name="ivp"))
 
     monkeypatch.setattr(configuration, "settings", with_ivp)
-    for recipe in figures.run_recipes(["paper_circuit"]):
+    for recipe in figures.run_recipes(["paper_descriptor"]):
         panels = gallery.figures_of(recipe)
         assert list(gallery.check_references(TABLES, recipe.name, panels)) == []
 
