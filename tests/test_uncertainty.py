@@ -37,7 +37,10 @@ sys.path.insert(0, str(ROOT / "docs"))
 import uncertainty as page
 
 SEEDS = 300
-WHY = "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
+WHY = (
+    "a missing or wrong parameter, a column in another unit (data.scale, data.time_unit), a sensor "
+    "that drifts or saturates, a noisy input, or a delay"
+)
 TIMES = " times what the sensors' noise makes"
 ESTIMATORS = (
     {"name": "gradient"}, {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3},

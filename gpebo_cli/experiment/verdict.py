@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
@@ -28,7 +29,8 @@ _LESS = 0.1  # of the sensors' noise: less than that says nothing against the mo
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _SUSPECTED = (
-    "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
+    "a missing or wrong parameter, a column in another unit (data.scale, data.time_unit), a sensor "
+    "that drifts or saturates, a noisy input, or a delay"
 )
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
@@ -168,6 +170,12 @@ def _cost_and_loss(simulated: SimulationResult) -> str:
             "(error_estimate.by_state in summary.json)"
         )
     return told
+
+
+def columns_note(names: Sequence[str]) -> str:
+    """What the last line of a run has to say of columns that are read for several signals."""
+    several = [name for name, count in Counter(names).items() if count > 1]
+    return f"; read for several signals: column {', '.join(several)}" if several else ""
 
 
 def rows_note(left_out: int, filled: int, policy: str) -> str:

@@ -39,6 +39,7 @@ from gpebo_cli.model.expressions import (
     with_others,
 )
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.schema import instant
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
@@ -67,8 +68,9 @@ class Piecewise:
         if len(t) and (t.min() < first - slack or t.max() > last + slack):
             beyond = t.min() if t.min() < first - slack else t.max()
             raise ConfigError(
-                f"{self.where} is of t = {first:g} to {last:g}, and the experiment needs "
-                f"t = {beyond:g}; set time.start and time.horizon, or give a longer table"
+                f"{self.where} is of t = {instant(first, 6)} to {instant(last, 6)}, and the "
+                f"experiment needs t = {instant(beyond, 6)}; set time.start and time.horizon, or "
+                "give a longer table"
             )
 
     def taylor(self, t: Array, order: int, inside: Array) -> Array:
@@ -208,7 +210,7 @@ class TextCoefficients:
                 at += (then - first) * before / (before - after)
             raise ConfigError(
                 f"{where.where} = {shorten(where.text)} divides by something that passes through "
-                f"zero near t = {at:.6g}"
+                f"zero near t = {instant(at, 6)}"
             )
 
     def entries(
