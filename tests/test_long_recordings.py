@@ -412,6 +412,22 @@ def test_the_residual_of_two_long_files_is_that_of_their_rows(tmp_path):
         assert found.residual == pytest.approx([np.std(left[: len(data)])], rel=0.01)
 
 
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_level_of_the_noise_is_that_of_the_rows_whatever_makes_elements_many(hold, tmp_path):
+    """Functions of time do, whose cells are shorter than steps between rows."""
+    t = np.linspace(0.0, 4.0, 41)
+    y = np.exp(-t) + 0.1 * np.random.default_rng(0).standard_normal(41)
+    data = {"file": write_table(tmp_path / "r.csv", {"t": t, "y": y}), "hold": hold}
+    few, many = (
+        run(one_state(phi=[phi]), data=data, estimator="least_squares", time={"samples": 5})
+        for phi in ("0", "1e-13*sin(300*t)")
+    )
+    assert [each.details.recording.elements for each in (few, many)] == [40, 160]
+    one, other = (each.details.estimation.states_std[0, -1] for each in (few, many))
+    assert other == pytest.approx(one, rel=1e-9)
+    assert many.details.fit.residual == pytest.approx(few.details.fit.residual, rel=1e-9)
+
+
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():
     with pytest.raises(ConfigError, match="monotone is for a regression with S and box"):
         run("battery", data={"file": "nowhere.csv"}, estimator="monotone")

@@ -126,7 +126,8 @@ def beyond(
     """
     fine = edges(signals.mesh.edges, mesh.edges)
     cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
-    first, zeta, samples = 0, np.zeros((len(size), 1)), signals.mesh.edges
+    first, zeta, noise = 0, np.zeros((len(size), 1)), signals.noise
+    samples = signals.mesh.edges if noise is None or noise.rows is None else noise.rows.t
     errors = _interpolated(errors, mesh, solver.tol)
 
     def difference(t: Array, inside: Array) -> Array:
