@@ -1345,6 +1345,31 @@ def test_rows_that_are_left_out_are_said(tmp_path):
     assert "cells filled" not in said
 
 
+def test_functions_that_a_plant_has_for_its_inputs_do_not_count(tmp_path):
+    """Neither a pole, nor a table that is too short, nor what changes so often that it takes long.
+
+    But of an input that stands in a matrix as well.
+    """
+    t = np.linspace(0.0, 4.0, 11)
+    data = {"t": t, "u": 2.0 + np.sin(t), "v": np.cos(t), "y": np.exp(-t)}
+    file = write_table(tmp_path / "r.csv", data)
+    short = {"file": write_table(tmp_path / "v.csv", {"t": t[:3], "v": t[:3]})}
+    plant = one_state(B=[[1, 1]], unknowns={"a": 0}, F=[[1]])
+    results = []
+    for v in "0", "1/(t - 2) + 1e-9*sin(1e6*t)", short:
+        given = {**plant, "inputs": {"u": "log(t)", "v": v}}
+        results.append(run(given, data=file, estimator="least_squares", time={"samples": 5}))
+        assert all(found.holds for found in check(given, data=file))
+    for found in results[1:]:
+        assert (found.estimates["a"] == results[0].estimates["a"]).all()
+        assert found.verdict == results[0].verdict
+    follows = {**plant, "A": [["-u"]], "inputs": {"u": "sin(t)", "v": "cos(t)"}}
+    source = plant_from_mapping(follows).coefficients
+    found = source.of_recordings
+    assert found.taylor(np.ones(1), 1).u.tolist() == [[[np.sin(1.0), 0.0]], [[np.cos(1.0), 0.0]]]
+    assert (found.taylor(np.ones(1), 0).A == source.taylor(np.ones(1), 0).A).all()
+
+
 def test_a_column_that_is_read_for_several_signals_is_said():
     t = np.linspace(0.0, 4.0, 41)
     frame = pd.DataFrame({"t": t, "u": np.sin(t), "y": np.cos(t)})

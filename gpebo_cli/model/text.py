@@ -17,6 +17,7 @@ from gpebo_cli.model.descriptor import (
     BoolArray,
     Coefficients,
     CoefficientSource,
+    DescriptorSystem,
     IntArray,
 )
 from gpebo_cli.model.entries import Entries, Places, entries_of
@@ -354,8 +355,33 @@ class TextCoefficients:
         return replace(self, tables=tables, restricted=own)
 
     @cached_property
+    def of_recordings(self) -> TextCoefficients:
+        """The same with zero for inputs that no matrix follows, of which a recording has others."""
+        targets, outputs = self.assembly.targets, np.array(self.tape.outputs, dtype=np.intp)
+        u = MATRIX_NAMES.index("u")
+        others = outputs[targets[:, 0] != u].tolist()
+        idle = [k for k in range(self.m) if self.tape.following({k}).isdisjoint(others)]
+        kept = (targets[:, 0] != u) | ~np.isin(targets[:, 1], idle)
+        fixed = list(self.assembly.fixed)
+        fixed[u] = np.where(np.isin(np.arange(self.m), idle), 0.0, fixed[u])
+        tape = self.tape.of(outputs[kept].tolist())
+        return replace(
+            self, assembly=Assembly(tape, targets[kept], tuple(fixed)),
+            tables={k: table for k, table in self.tables.items() if k not in idle},
+            restricted=self.restricted and self.restricted.of_recordings,
+        )
+
+    @cached_property
     def _bounds(self) -> Bounds:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
+
+
+def as_recorded(system: DescriptorSystem) -> DescriptorSystem:
+    """The plant of a recording: functions of time that its text has for inputs do not count."""
+    source = system.coefficients
+    if not isinstance(source, TextCoefficients) or system.regression is not None:
+        return system
+    return replace(system, coefficients=source.of_recordings)
 
 
 def switching(source: CoefficientSource) -> Tape | None:
