@@ -29,8 +29,8 @@ _LESS = 0.1  # of the sensors' noise: less than that says nothing against the mo
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _SUSPECTED = (
-    "a missing or wrong parameter, a column in another unit (data.scale, data.time_unit), a sensor "
-    "that drifts or saturates, a noisy input, or a delay"
+    "a missing or wrong parameter, a column of another unit or sign (data.scale, data.time_unit), "
+    "a sensor that drifts or saturates, a noisy input, or a delay"
 )
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
@@ -102,9 +102,11 @@ def _explains(fit: Fit, case: int) -> str:
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
     if residual <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    coarse = f"rows too far apart for what {', '.join(fit.coarse)} does between them (data.hold)"
     if fit.least_white:
         of_least = "that of least squares that weigh each output by its noise is"
-        return f": the residual{noise and noise + ','} is not white, {of_least}: {_OF_ESTIMATES}"
+        why = f"{_OF_ESTIMATES}, or of {coarse}" if fit.coarse else _OF_ESTIMATES
+        return f": the residual{noise and noise + ','} is not white, {of_least}: {why}"
     if fit.far:
         told = (f"{count} of {name} (first at t = {instant(t, 6)})" for name, count, t in fit.far)
         rest = "" if fit.white else (
@@ -129,6 +131,7 @@ def _explains(fit: Fit, case: int) -> str:
     if fit.rounded:
         steps = ", ".join(f"{name} to steps of {step:.2g}" for name, step in fit.rounded)
         why = f"that it is rounding ({steps}), for which deviations are too small, or {why}"
+    why = f"{coarse}, or {why}" if fit.coarse else why
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}"
