@@ -486,7 +486,7 @@ def test_a_rate_that_is_five_percent_off_follows_the_input():
     assert "it follows the inputs), which suggests" in said
     silent = {"t": made.t, **made.inputs, "y": made["y"]}  # less is left than y changes by
     said = run(wrong, data={k: x[::40] for k, x in silent.items()}, estimator="ls_drem").verdict
-    assert "which suggests a missing or wrong parameter" in said
+    assert "(data.hold), or a missing or wrong parameter" in said
 
 
 def test_what_a_sensor_shows_too_much_at_all_times_is_told():
