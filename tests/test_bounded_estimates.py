@@ -272,6 +272,20 @@ def test_bounds_of_one_number_say_what_an_unknown_is():
     np.testing.assert_allclose(found.estimates["leak"][0], -0.02, rtol=1e-9)
 
 
+def test_a_bound_on_what_others_can_stand_for_changes_nothing_and_that_is_said():
+    """Of two leaks the data have the sum: one may be what its bound says, and the states stay."""
+    two = {**TANK, "unknowns": {"leak": -0.05, "other": 0.0}, "F": [[-1, -1], [0, 0]]}
+    free, *held = (
+        run(two, observer={"name": "gpebo", "bounds": {"unknowns": bounds}},
+            time={"horizon": HORIZON, "samples": 21}, estimator={"name": "least_squares"})
+        for bounds in ({}, {"leak": [0, None]}, {"other": [1, None]})
+    )
+    for found, name in zip(held, ("leak", "other"), strict=True):
+        assert (found.estimates["h1"] == free.estimates["h1"]).all()
+        assert f"; without effect, for want of data: observer.bounds of {name}" in found.verdict
+        assert "held by bounds" not in found.verdict
+
+
 def test_bounds_hold_in_any_units():
     def bounded(unit):
         plant = {**TANK, "inputs": {"V": f"{unit}*sin(t)"}, "unknowns": {"leak": -0.05 * unit},

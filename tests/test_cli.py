@@ -244,6 +244,7 @@ WRONG = [
     (["run", "plant.states.9=1"], "plant.states.9=1: a list is given as a whole, as in"),
     (["run", "+plant.states.x=1"], "+plant.states.x=1: a list is given as a whole, as in"),
     (["run", "output=[1]"], "output=[1]: it has keys and is no list"),
+    (["run", "hydra.run=3"], "hydra.run=3: it has keys and is no value"),
     (["run", "-m", "time.horizon=range(5,1)"], "a sweep of no jobs: a range is empty"),
     (["run", "-m", "estimator=glob(none*)"], "or glob(…) finds no file"),
     (["run", "-m", "plant=circuit,circut"], "plant=circut: there is no such plant"),

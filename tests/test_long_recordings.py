@@ -412,6 +412,21 @@ def test_the_residual_of_two_long_files_is_that_of_their_rows(tmp_path):
         assert found.residual == pytest.approx([np.std(left[: len(data)])], rel=0.01)
 
 
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_the_level_of_the_noise_is_that_of_the_rows_whatever_makes_elements_many(hold, tmp_path):
+    """Functions of time do, whose cells are shorter than steps between rows."""
+    t = np.linspace(0.0, 4.0, 41)
+    y = np.exp(-t) + 0.1 * np.random.default_rng(0).standard_normal(41)
+    data = {"file": write_table(tmp_path / "r.csv", {"t": t, "y": y}), "hold": hold}
+    few, many = (
+        run(one_state(phi=[phi]), data=data, estimator="least_squares", time={"samples": 5})
+        for phi in ("0", "1e-13*sin(300*t)")
+    )
+    assert many.details.recording.elements >= 4 * few.details.recording.elements
+    one, other = (each.details.estimation.states_std[0, -1] for each in (few, many))
+    assert other == pytest.approx(one, rel=1e-9)
+
+
 def test_an_estimator_without_its_map_is_refused_before_a_file_is_read():
     with pytest.raises(ConfigError, match="monotone is for a regression with S and box"):
         run("battery", data={"file": "nowhere.csv"}, estimator="monotone")
@@ -471,7 +486,7 @@ def test_a_rate_that_is_five_percent_off_follows_the_input():
     assert "it follows the inputs), which suggests" in said
     silent = {"t": made.t, **made.inputs, "y": made["y"]}  # less is left than y changes by
     said = run(wrong, data={k: x[::40] for k, x in silent.items()}, estimator="ls_drem").verdict
-    assert "which suggests a missing or wrong parameter" in said
+    assert "(data.hold), or a missing or wrong parameter" in said
 
 
 def test_what_a_sensor_shows_too_much_at_all_times_is_told():

@@ -333,6 +333,8 @@ BAD = {
     "a repeated time": ("t,V,y\n0,1,2\n0,1,3\n", ["line 3", "column t", "repeats", "line 2"]),
     "a decreasing time": ("t,V,y\n1,1,2\n0.5,1,3\n", ["line 3", "column t", "is before"]),
     "a missing column": ("t,v,y\n0,1,2\n1,1,3\n", ["line 1", "no column V", "mean v?"]),
+    "a line above the header": ("Model,M3\n" + GOOD, ["line 1", "is line 1 the header? It has to"]),
+    "line ends of an old Mac": (GOOD.replace("\n", "\r"), ["line 1: a carriage return", "or CRLF"]),
     "a double column": ("t,V,y,y\n0,1,2,2\n", ["line 1", "column y", "2 times"]),
     "nan": ("t,V,y\n0,1,2\n1,nan,3\n", ["line 3", "column V", "'nan'", "finite"]),
     "inf": ("t,V,y\n0,1,2\n1,1,-inf\n", ["line 3", "column y", "finite"]),
@@ -590,6 +592,10 @@ def test_dates_are_seconds_after_the_first(tmp_path):
     path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in [days[0], "29/02/2024"]))
     with pytest.raises(ConfigError, match=r"line 3, column t: '29/02/2024' is not a date"):
         read(path, time_unit="datetime")
+    clock = ["2025-10-26 02:59:30", "2025-10-26 02:00:00"]  # half a minute later in Berlin
+    path.write_text("t,V,y\n" + "".join(f"{time},1,2\n" for time in clock))
+    with pytest.raises(ConfigError, match=r"times must increase; local times go back where summer"):
+        read(path, time_unit="datetime")
 
 
 def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
@@ -721,6 +727,13 @@ def test_a_span_that_is_not_recorded(tmp_path, time, parts):
     path.write_text(GOOD)
     with refused(*parts):
         load(shipped("circuit"), DataSettings("csv", str(path)), time, 1e-12)
+
+
+def test_the_span_of_a_recording_by_the_clock_is_told_to_hundredths(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text("t,V,y\n1764259200.5,1,2\n1764259201,1,3\n")
+    with refused("is of t = 1764259200.5 to 1764259201, which does not have time.start = 0"):
+        load(shipped("circuit"), DataSettings("csv", str(path)), TimeSettings(0.0, 1.0, 11), 1e-12)
 
 
 def test_rows_of_a_span_are_those_inside_of_it_and_its_ends(tmp_path):
@@ -954,11 +967,24 @@ def test_signals_that_are_not_found_are_said(tmp_path):
         (b"t,V,y\n", "lab.csv has no rows below its header"),
         (b"t\n0\n1\n", "lab.csv: no character of comma, semicolon, tab and space cuts its first"),
         (b"t,V\n0,1,2\n", "lab.csv: no character of comma, semicolon, tab and space cuts its f"),
+        (b"t,V,y\r0,1,2\r1,2,3\r", "lab.csv, line 1: a carriage return without a newline"),
         (b"t,V,y\n" + b"0,1,2\n" * 60 + b"3" * 200_000, "lab.csv is not CSV: field larger than"),
     ):
         path.write_bytes(content)
         with refused(message):
             guess(str(path), shipped("circuit"))
+
+
+@pytest.mark.parametrize(("above", "told"), [
+    ('Model,M3\nRecord,"2",s\n\n', "if line 4 is the header, remove what stands above it"),
+    ("0,0\n", "if line 2 is the header"),
+    ("t,V\n0,1\n1,2\n0,1,2\n", "is the first line the header?"),
+])
+def test_lines_above_the_header_are_told_by_the_number_of_the_header(tmp_path, above, told):
+    path = tmp_path / "lab.csv"
+    path.write_text(above + ("0,1,2\n" if "?" in told else "t,V,y\n0,1,2\n1,2,3\n"))
+    with refused(f"the same number of cells, two at least; {told}"):
+        guess(str(path), shipped("circuit"))
 
 
 def test_a_line_is_looked_at_that_is_longer_than_a_cell(tmp_path):
@@ -985,6 +1011,10 @@ def test_numbers_that_stand_for_gaps_are_said(tmp_path):
 
     path.write_text("t,V,y\n0,1,-999\n1,2,2\n2,3,-999\n3,2,2.5\n")
     assert guess(str(path), shipped("circuit")).gaps == [-999.0]
+    cells = "9.91E+37", "-9.9e37", "+9.91E+37", "9.9E37"  # SCPI: no number, and infinities
+    rows = "".join(f"{k},{k % 3},{cells[k // 2]}\n" for k in range(8))
+    path.write_text(f"t,V,y\n{rows}8,1,2\n")
+    assert guess(str(path), shipped("circuit")).gaps == [9.91e37, -9.9e37, 9.9e37]
 
 
 DAYS = "column time (days) may be in days, t is in s: data.scale.t is the factor between them"
@@ -1338,6 +1368,39 @@ def test_rows_that_are_left_out_are_said(tmp_path):
     said = run("descriptor", data=data).verdict
     assert "; rows left out (data.missing=interpolate): 5, they are before the first" in said
     assert "cells filled" not in said
+
+
+def test_functions_that_a_plant_has_for_its_inputs_do_not_count(tmp_path):
+    """Neither a pole, nor a table that is too short, nor what changes so often that it takes long.
+
+    But of an input that stands in a matrix as well.
+    """
+    t = np.linspace(0.0, 4.0, 11)
+    data = {"t": t, "u": 2.0 + np.sin(t), "v": np.cos(t), "y": np.exp(-t)}
+    file = write_table(tmp_path / "r.csv", data)
+    short = {"file": write_table(tmp_path / "v.csv", {"t": t[:3], "v": t[:3]})}
+    plant = one_state(B=[[1, 1]], unknowns={"a": 0}, F=[[1]])
+    results = []
+    for v in "0", "1/(t - 2) + 1e-9*sin(1e6*t)", short:
+        given = {**plant, "inputs": {"u": "log(t)", "v": v}}
+        results.append(run(given, data=file, estimator="least_squares", time={"samples": 5}))
+        assert all(found.holds for found in check(given, data=file))
+    for found in results[1:]:
+        assert (found.estimates["a"] == results[0].estimates["a"]).all()
+        assert found.verdict == results[0].verdict
+    follows = {**plant, "A": [["-u"]], "inputs": {"u": "sin(t)", "v": "cos(t)"}}
+    source = plant_from_mapping(follows).coefficients
+    found = source.of_recordings
+    assert found.taylor(np.ones(1), 1).u.tolist() == [[[np.sin(1.0), 0.0]], [[np.cos(1.0), 0.0]]]
+    assert (found.taylor(np.ones(1), 0).A == source.taylor(np.ones(1), 0).A).all()
+
+
+def test_a_column_that_is_read_for_several_signals_is_said():
+    t = np.linspace(0.0, 4.0, 41)
+    frame = pd.DataFrame({"t": t, "u": np.sin(t), "y": np.cos(t)})
+    for columns in {}, {"u": "y"}:
+        said = run("descriptor", data={"frame": frame, "columns": columns}).verdict
+        assert ("; read for several signals: column y" in said) == bool(columns)
 
 
 def test_cells_that_are_filled_have_no_error_of_their_own():

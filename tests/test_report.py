@@ -21,9 +21,10 @@ from factories import make_result, with_figures
 from processes import assert_refused, refused
 
 from gpebo_cli import run
-from gpebo_cli.cli import compare, report
+from gpebo_cli.cli import check, compare, report
 from gpebo_cli.errors import ConfigError, GpeboError
 from gpebo_cli.experiment.result import Fit, NoiseStatistics
+from gpebo_cli.findings import Assumption
 from gpebo_cli.results import comparison, document, html
 from gpebo_cli.results.comparison import figures
 from gpebo_cli.results.finished import find
@@ -82,6 +83,9 @@ def test_times_of_a_clock_are_told_to_hundredths_of_a_second():
     assert f"well determined from t = {round(since[1], 2):.15g} s on" in found.verdict
     (row,) = [line for line in estimate_table(found.details) if "e0_x" in line]
     assert row.count("  1764259") + row.count("from 1764259") == 2
+    evidence = {"at": found.excitation.t_c, "condition": 123456.0}
+    told = check._table("", [Assumption("A", "s", True, evidence)], [])
+    assert f"at {round(since[0], 2):.15g}, condition 1.235e+05" in told
     assert [instant(x) for x in (0.0496249, 9999.4, 20000.0)] == ["0.04962", "9999", "20000"]
 
 

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from examples import ROOT
 from plants import one_state, shipped
+from processes import write_table
 from scipy.linalg import expm
 
 from gpebo_cli import run
@@ -37,7 +38,10 @@ sys.path.insert(0, str(ROOT / "docs"))
 import uncertainty as page
 
 SEEDS = 300
-WHY = "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
+WHY = (
+    "a missing or wrong parameter, a column of another unit or sign (data.scale, data.time_unit), "
+    "a sensor that drifts or saturates, a noisy input, or a delay"
+)
 TIMES = " times what the sensors' noise makes"
 ESTIMATORS = (
     {"name": "gradient"}, {"name": "least_squares"}, {"name": "least_squares", "beta": 0.3},
@@ -343,6 +347,7 @@ def test_gaps_written_as_numbers_and_rounding_are_told(change, told):
     assert told in run(plant, data={"t": t, "y": y}).verdict
 
 
+COARSE = "rows too far apart for what y does between them (data.hold)"
 NOTHING = np.zeros(5)
 WHITE = ": the estimates explain the data up to white noise"
 NOT = " is not white (its correlation is "
@@ -380,6 +385,12 @@ FAR = (": some samples are far from what explains the others, 24 of y (first at 
     ({"slow": True, "least_white": True, "ratio": 1.0, "far": [("y", 1, 0.0)]}, (
         f": the residual, 1.00{TIMES}, is not white, that of least squares that weigh each output "
         "by its noise is: what is left says more of these estimates than of the model")),
+    ({"slow": True, "least_white": True, "coarse": ["y"]}, (
+        ": the residual is not white, that of least squares that weigh each output by its noise "
+        f"is: what is left says more of these estimates than of the model, or of {COARSE}")),
+    ({"slow": True, "coarse": ["y"]}, (f": the residual{NOT}0.00, and a part of it is slow), which "
+                                       f"suggests {COARSE}, or {WHY}")),
+    ({"coarse": ["y"]}, WHITE),
     ({"slow": True, "rounded": [("y", 0.05)]}, (
         f": the residual{NOT}0.00, and a part of it is slow), which suggests that it is rounding "
         f"(y to steps of 0.05), for which deviations are too small, or {WHY}")),
@@ -391,6 +402,21 @@ def test_what_a_residual_says_of_the_model(fit, said):
     """Of five correlations one may be beyond the band of 0.2."""
     made = {"residual": [0.05], "size": 1.0, "least": 0.05, "correlation": NOTHING, "band": 0.2}
     assert _explains(Fit(**made | fit), 0) == said
+
+
+@pytest.mark.parametrize(("hold", "rows", "wrong", "told"), [
+    ("linear", 61, 0.0, True), ("zoh", 61, 0.0, True), ("linear", 601, 0.3, False),
+    ("zoh", 601, 0.3, False),
+])
+def test_rows_too_far_apart_for_the_hold_are_told(hold, rows, wrong, told, tmp_path):
+    """Of exact data and the right plant, not of a wrong one with rows that are close enough."""
+    t = np.linspace(0.0, 24.0, rows)
+    y = 1.0 + 0.5 * (np.sin(t) - np.cos(t)) + wrong / 3.0 * np.cos(2.0 * t)
+    plant = one_state(A=[[-1]], F=[["1", "sin(t)"]], unknowns={"a": 1, "b": 1})
+    data = {"file": write_table(tmp_path / "r.csv", {"t": t, "y": y}), "hold": hold}
+    said = run(plant, data=data, estimator="least_squares", time={"samples": 101}).verdict
+    assert "the residual is not white" in said
+    assert (COARSE in said) == told
 
 
 def test_what_the_residual_of_a_right_plant_is_coloured_by_is_said():

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gpebo_cli.findings import Assumption
 
 _WIDTH = 100
+_TIMES = ("at", "t_c")  # in evidence
 
 _ADVICE = {
     "Solvability": "every state needs an equation of its own: look for a row that is missing, zero "
@@ -134,7 +135,8 @@ def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
     for a in found:
         lines.append(f"  {'holds' if a.holds else 'FAILS'}  {a.name:<{width}}  {a.statement}")
         evidence = ", ".join(
-            f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {'none' if v is None else v}"
+            f"{k} {'none' if v is None else v}" if not isinstance(v, float)
+            else f"{k} {instant(v) if k in _TIMES else f'{v:.4g}'}"
             for k, v in a.evidence.items()
         )
         lines += _wrapped(evidence, " " * (width + 11))

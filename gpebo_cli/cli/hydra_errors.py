@@ -29,6 +29,7 @@ _AS_A_WHOLE = "a list is given as a whole, as in plant.outputs=[y]"
 _OF_LISTS = {
     "list index out of range": _AS_A_WHOLE, "is not an int": _AS_A_WHOLE,
     "Cannot merge DictConfig with ListConfig": "it has keys and is no list",
+    "is not a subclass of": "it has keys and is no value",
 }
 _OF_NUMBERS = ("time", "solver", "excitation")  # sections without a list
 

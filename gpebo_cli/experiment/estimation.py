@@ -104,6 +104,12 @@ def continuous(
         seen, names = seen_at(known), (regression.parameters, system.states)
         told = dict(zip(system.states, seen[-1], strict=True))
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
+        given = observation.bounds or {}
+        idle = [name for kind in given.values() for name in kind if not told.get(name, True)]
+        observation = replace(observation, bounds={
+            kind: {name: pair for name, pair in pairs.items() if name not in idle}
+            for kind, pairs in given.items()
+        })
         estimator = estimators.tuned(estimator, regression)
         try:
             estimation, metrics = _estimate(
@@ -140,7 +146,10 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why),
+        _gains(observation, estimation), _no_deviations(why) + (
+            f"; without effect, for want of data: observer.bounds of {', '.join(idle)}"
+            if idle else ""
+        ),
     )
 
 

@@ -112,6 +112,20 @@ def _weighed(columns: Array, residual: Array, y: Array) -> Array:
     return np.asarray(columns @ (scale * found[0]))
 
 
+def _missed(t: Array, y: Array, source: Source) -> Array:
+    """How far outputs (N, r) at times t (N,) are from what is assumed between these, about, (r,).
+
+    From a held value by 1/√3 of a step, from a line by a quarter of what a row is from its
+    neighbours' one.
+    """
+    if source.rows is None or not source.rows.lines:
+        far = np.diff(y, axis=0) / np.sqrt(3.0)
+    else:
+        share = (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+        far = 0.25 * (y[1:-1] - y[:-2] - share[:, None] * (y[2:] - y[:-2]))
+    return np.asarray(np.sqrt(np.nan_to_num(far**2).mean(axis=0)))
+
+
 def _step(y: Array) -> float:
     """What an output (N,) is rounded to; 0.0 where most changes are no multiples of one step."""
     change = np.abs(np.diff(y))
@@ -204,6 +218,11 @@ def _explained(
                 system.outputs, map(_step, y.T), np.sqrt(power / count), strict=True
             ) if own < _ROUNDING * step
         ],
+        coarse=[
+            name for name, missed, own in zip(
+                system.outputs, _missed(t, y, source), np.sqrt(power / count), strict=True
+            ) if missed > own
+        ] if t is samples else (),
         correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
         follows=_follows(residual[:, seen], u[::stride]),
         in_matrices=() if observation.errors is not None else tuple(

@@ -184,6 +184,7 @@ class Fit:
     band: float = np.nan  # 95 % of the correlations of white noise are within
     far: Sequence[tuple[str, int, float]] = ()  # outputs, samples far from most, time of the first
     rounded: Sequence[tuple[str, float]] = ()  # outputs, and steps above what is left of them
+    coarse: Sequence[str] = ()  # outputs that the hold may miss between rows by more than that
     least_white: bool = False  # whether that of weighed least squares is, where it is not
     of_inputs: tuple[str, ...] = ()  # inputs with noise, which the plant colours
     in_matrices: tuple[str, ...] = ()  # outputs, whose noise there is no error of Y

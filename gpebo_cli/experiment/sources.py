@@ -14,6 +14,7 @@ from gpebo_cli.experiment.assumptions import of_simulation
 from gpebo_cli.experiment.noise import NoiseLevels, measure
 from gpebo_cli.experiment.result import RecordingResult, SimulationResult, StateChange
 from gpebo_cli.experiment.verdict import (
+    columns_note,
     functions_note,
     pauses_note,
     rows_note,
@@ -119,7 +120,8 @@ def recorded(
             first=float(samples_t[0]), last=float(samples_t[-1]),
             known_states=tuple(system.states[i] for i in table.header.known),
             elements=recording.inputs.mesh.size, bounded=recording.bounded,
-            note=rows_note(table.left_out, table.filled, settings.data.missing)
+            note=columns_note(table.header.names[1 : 1 + system.m + system.r])
+            + rows_note(table.left_out, table.filled, settings.data.missing)
             + pauses_note(recording.rows),
         ),
     )

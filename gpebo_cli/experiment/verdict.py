@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
@@ -28,7 +29,8 @@ _LESS = 0.1  # of the sensors' noise: less than that says nothing against the mo
 _FEW = 4.0  # the same where integrals of noise are all that is left: few independent numbers
 _EXACT = 1e-4  # of Y: what is left is the interpolation between samples
 _SUSPECTED = (
-    "a missing or wrong parameter, a sensor that drifts or saturates, a noisy input, or a delay"
+    "a missing or wrong parameter, a column of another unit or sign (data.scale, data.time_unit), "
+    "a sensor that drifts or saturates, a noisy input, or a delay"
 )
 _OF_ESTIMATES = "what is left says more of these estimates than of the model"
 _TAKEN_OUT = "observer.remedy=noise_free takes it out"
@@ -100,9 +102,11 @@ def _explains(fit: Fit, case: int) -> str:
         return noise + (f", which suggests {why}" if fit.ratio > _FEW else "")
     if residual <= _EXACT * fit.size:
         return ": the estimates explain the data"
+    coarse = f"rows too far apart for what {', '.join(fit.coarse)} does between them (data.hold)"
     if fit.least_white:
         of_least = "that of least squares that weigh each output by its noise is"
-        return f": the residual{noise and noise + ','} is not white, {of_least}: {_OF_ESTIMATES}"
+        why = f"{_OF_ESTIMATES}, or of {coarse}" if fit.coarse else _OF_ESTIMATES
+        return f": the residual{noise and noise + ','} is not white, {of_least}: {why}"
     if fit.far:
         told = (f"{count} of {name} (first at t = {instant(t, 6)})" for name, count, t in fit.far)
         rest = "" if fit.white else (
@@ -127,6 +131,7 @@ def _explains(fit: Fit, case: int) -> str:
     if fit.rounded:
         steps = ", ".join(f"{name} to steps of {step:.2g}" for name, step in fit.rounded)
         why = f"that it is rounding ({steps}), for which deviations are too small, or {why}"
+    why = f"{coarse}, or {why}" if fit.coarse else why
     return (
         f": the residual{noise and noise + ','} is not white (its correlation is "
         f"{np.abs(fit.correlation).max():.2f}{', and a part of it is slow' * fit.slow}"
@@ -168,6 +173,12 @@ def _cost_and_loss(simulated: SimulationResult) -> str:
             "(error_estimate.by_state in summary.json)"
         )
     return told
+
+
+def columns_note(names: Sequence[str]) -> str:
+    """What the last line of a run has to say of columns that are read for several signals."""
+    several = [name for name, count in Counter(names).items() if count > 1]
+    return f"; read for several signals: column {', '.join(several)}" if several else ""
 
 
 def rows_note(left_out: int, filled: int, policy: str) -> str:

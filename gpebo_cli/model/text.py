@@ -17,6 +17,7 @@ from gpebo_cli.model.descriptor import (
     BoolArray,
     Coefficients,
     CoefficientSource,
+    DescriptorSystem,
     IntArray,
 )
 from gpebo_cli.model.entries import Entries, Places, entries_of
@@ -39,6 +40,7 @@ from gpebo_cli.model.expressions import (
     with_others,
 )
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.schema import instant
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.
 MatrixEntries = tuple[tuple[int, ...], dict[int, Expression]]
@@ -67,8 +69,9 @@ class Piecewise:
         if len(t) and (t.min() < first - slack or t.max() > last + slack):
             beyond = t.min() if t.min() < first - slack else t.max()
             raise ConfigError(
-                f"{self.where} is of t = {first:g} to {last:g}, and the experiment needs "
-                f"t = {beyond:g}; set time.start and time.horizon, or give a longer table"
+                f"{self.where} is of t = {instant(first, 6)} to {instant(last, 6)}, and the "
+                f"experiment needs t = {instant(beyond, 6)}; set time.start and time.horizon, or "
+                "give a longer table"
             )
 
     def taylor(self, t: Array, order: int, inside: Array) -> Array:
@@ -208,7 +211,7 @@ class TextCoefficients:
                 at += (then - first) * before / (before - after)
             raise ConfigError(
                 f"{where.where} = {shorten(where.text)} divides by something that passes through "
-                f"zero near t = {at:.6g}"
+                f"zero near t = {instant(at, 6)}"
             )
 
     def entries(
@@ -352,8 +355,33 @@ class TextCoefficients:
         return replace(self, tables=tables, restricted=own)
 
     @cached_property
+    def of_recordings(self) -> TextCoefficients:
+        """The same with zero for inputs that no matrix follows, of which a recording has others."""
+        targets, outputs = self.assembly.targets, np.array(self.tape.outputs, dtype=np.intp)
+        u = MATRIX_NAMES.index("u")
+        others = outputs[targets[:, 0] != u].tolist()
+        idle = [k for k in range(self.m) if self.tape.following({k}).isdisjoint(others)]
+        kept = (targets[:, 0] != u) | ~np.isin(targets[:, 1], idle)
+        fixed = list(self.assembly.fixed)
+        fixed[u] = np.where(np.isin(np.arange(self.m), idle), 0.0, fixed[u])
+        tape = self.tape.of(outputs[kept].tolist())
+        return replace(
+            self, assembly=Assembly(tape, targets[kept], tuple(fixed)),
+            tables={k: table for k, table in self.tables.items() if k not in idle},
+            restricted=self.restricted and self.restricted.of_recordings,
+        )
+
+    @cached_property
     def _bounds(self) -> Bounds:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
+
+
+def as_recorded(system: DescriptorSystem) -> DescriptorSystem:
+    """The plant of a recording: functions of time that its text has for inputs do not count."""
+    source = system.coefficients
+    if not isinstance(source, TextCoefficients) or system.regression is not None:
+        return system
+    return replace(system, coefficients=source.of_recordings)
 
 
 def switching(source: CoefficientSource) -> Tape | None:

@@ -13,6 +13,7 @@ from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.errors import EPS
 from gpebo_cli.numerics.mesh import Kind, Mesh, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearProblem
+from gpebo_cli.schema import instant
 
 _MAX_PARTS = 8  # an element is cut into at most this many at once
 _ROUNDING = 1e-6  # a tail below may be rounding, which cutting does not make smaller
@@ -89,7 +90,7 @@ def refine(
                 elif many or left * stuck.sum() > _SOME:
                     t = mesh.points[int(np.argmax(np.where(noisy, other, 0.0))), 0]
                     raise RoundingError(
-                        f"the {name} cannot be resolved near t = {t:.6g}: rounding in its "
+                        f"the {name} cannot be resolved near t = {instant(t, 6)}: rounding in its "
                         f"equations is {left:.1e} of it, whatever the elements; accepted is a "
                         "solver.tol above that, or equations that lose fewer digits", there,
                     )
@@ -139,7 +140,7 @@ def _check_budget(
     if parts.sum() > max_elements:
         raise SolverError(
             f"the {name} is not resolved with {max_elements} elements; worst near "
-            f"t = {t:.6g} (tail {tail[worst]:.1e}); {advice}"
+            f"t = {instant(t, 6)} (tail {tail[worst]:.1e}); {advice}"
         )
     if short:
         far = abs(mesh.edges[0]) > mesh.edges[-1] - mesh.edges[0]
@@ -148,6 +149,6 @@ def _check_budget(
             if far else "is there a jump or a singularity?"
         )
         raise SolverError(
-            f"the {name} cannot be resolved near t = {t:.6g}: elements reached the "
+            f"the {name} cannot be resolved near t = {instant(t, 6)}: elements reached the "
             f"resolution of floating point (tail {tail[worst]:.1e}); {why}"
         )

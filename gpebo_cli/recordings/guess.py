@@ -18,8 +18,9 @@ from operator import ne
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.recordings.lines import DATE, MISSING, TIME, seconds
+from gpebo_cli.recordings.lines import DATE, MISSING, TIME, seconds, split_cells
 from gpebo_cli.recordings.table import check_text, read_file, typed_table
+from gpebo_cli.settings import DataSettings
 
 _SEPARATORS = (",", ";", "\t", " ")
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1,
@@ -34,7 +35,8 @@ _STEPS = 0.5  # of its rows: an input that changes at so many of them may be one
 _RATES = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _BY_UNIT = "its unit"
 _LOOKED_AT = 50  # rows below the header
-_NINES = re.compile(r"-?9{3,}[.,]?[09]*")  # what loggers write where they have nothing
+# What loggers write where they have nothing, and instruments (SCPI) for no number or infinity.
+_NINES = re.compile(r"-?9{3,}[.,]?[09]*|[+-]?9[.,]91?0*[eE]\+?37")
 
 
 @dataclass
@@ -62,7 +64,7 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
         plain = frame.apply(lambda c: c.dt.total_seconds() if c.dtype.kind == "m" else c)
         content = plain.to_csv(index=False).encode()
     check_text(path, content)
-    lines = content.decode("utf-8-sig").rstrip().splitlines()
+    lines = content.decode("utf-8-sig").rstrip().replace("\r\n", "\n").split("\n")
     found = Guess()
     table = _table(path, lines[: _LOOKED_AT + 1], found)
     header, rows = [name.strip() for name in table[0]], table[1:]
@@ -101,19 +103,33 @@ def guess(path: str, system: DescriptorSystem) -> Guess:
 
 def _table(path: str, lines: Sequence[str], found: Guess) -> list[list[str]]:
     """Header and rows, split by the character that gives all of them most cells, and as many."""
+    best, found.separator = _cut(lines)
+    if not best:
+        split_cells(path, 1, lines[0], DataSettings())  # which may be none for a run, either
+        below = (k for k in range(1, len(lines) - 1) if _cut(lines[k:])[0])
+        named = (k for k in below if not lines[k].lstrip(' "+-.')[:1].isdigit())
+        line = next(named, 0) + 1
+        raise ConfigError(
+            f"{path}: no character of comma, semicolon, tab and space cuts its first lines into "
+            "the same number of cells, two at least; " + (
+                f"if line {line} is the header, remove what stands above it" if line > 1
+                else "is the first line the header?"
+            )
+        )
+    return best
+
+
+def _cut(lines: Sequence[str]) -> tuple[list[list[str]], str]:
+    """Cells of the lines, and the character between them; none, if that is no table."""
     best: list[list[str]] = []
+    found = ""
     for separator in _SEPARATORS:
         with suppress(csv.Error):  # by a wrong one, a line may be longer than a cell can be
             rows = list(csv.reader(lines, delimiter=separator))
             widths = {len(row) for row in rows}
             if len(widths) == 1 and len(rows[0]) > max(1, len(best[0]) if best else 1):
-                best, found.separator = rows, separator
-    if not best:
-        raise ConfigError(
-            f"{path}: no character of comma, semicolon, tab and space cuts its first lines into "
-            "the same number of cells, two at least; is the first line the header?"
-        )
-    return best
+                best, found = rows, separator
+    return best, found
 
 
 def _number(cell: str, decimal: str) -> float | None:

@@ -30,6 +30,7 @@ _WORDS = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}  # as data.
 _NUMBER = r"[ \t]*[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?[ \t]*"
 MISSING = ("", "-", "nan", "na", "n/a", "null", "none")  # where data.missing allows it
 _REPEATED = "; data.missing=drop leaves out rows whose time repeats"
+_LOCAL = "; local times go back where summer time ends, unless they have a zone (+02:00)"
 BLANK = b" \t\r"
 _LONGEST_LINE, _MOST_BLANK = 1 << 20, 1000
 DATE = "a date and time as in 2024-05-31T12:00:00.250 or 31.05.2024 12:00:00"
@@ -75,6 +76,10 @@ def separator(data: DataSettings) -> str:
 
 def split_cells(source: str, line: int, text: str, data: DataSettings) -> list[str]:
     """The cells of one line; cells may be quoted (ConfigError: the line is not CSV)."""
+    if "\r" in text:
+        raise ConfigError(
+            f"{source}, line {line}: a carriage return without a newline; lines end with LF or CRLF"
+        )
     if '"' not in text:
         return text.split(separator(data))
     try:
@@ -126,6 +131,7 @@ def read_header(
                 f"{source}, line 1: there is no column {name}; {kind} {system.name} needs "
                 f"{needed}, the header has {shown(', '.join(names))}{nearest(name, unused)}; "
                 "data.columns says what a signal is called"
+                + "; is line 1 the header? It has to be" * set(names).isdisjoint(wanted)
             )
     factors = {TIME: _SECONDS.get(data.time_unit, 1.0), **scale}
     return Header(
@@ -168,7 +174,8 @@ class RowReader:
             how = "repeats" if t == before else "is before"
             raise ConfigError(
                 f"{header.source}, line {line}, column {header.names[0]}: {t!r} {how} {before!r} "
-                f"of line {line_before}; times must increase{_REPEATED * (t == before)}"
+                f"of line {line_before}; times must increase"
+                + (_REPEATED if t == before else _LOCAL * (self._origin is not None))
             )
         if not math.isnan(t):
             self._last = (t, line)

@@ -18,6 +18,7 @@ from gpebo_cli.recordings.hold import Hold, each_of, held, holds, of_outputs, re
 from gpebo_cli.recordings.lines import Samples
 from gpebo_cli.recordings.table import Table, read_table
 from gpebo_cli.reduction.form import InputDerivatives
+from gpebo_cli.schema import instant
 from gpebo_cli.settings import DataSettings, TimeSettings
 
 _ROUNDING = 1e-12  # of the largest time: by how much a span may miss the samples
@@ -118,13 +119,14 @@ def _span(table: Table, time: TimeSettings) -> tuple[float, float]:
     whole = "time.start=null time.horizon=null take the whole file"
     if not first - slack <= start < last:
         raise ConfigError(
-            f"{path}, line {table.lines[0]}, column t: the recording is of t = {first:g} to "
-            f"{last:g}, which does not have time.start = {start:g}; {whole}"
+            f"{path}, line {table.lines[0]}, column t: the recording is of t = {instant(first, 6)} "
+            f"to {instant(last, 6)}, which does not have time.start = {instant(start, 6)}; {whole}"
         )
     if stop > last + slack:
         raise ConfigError(
-            f"{path}, line {table.lines[1]}, column t: the recording ends at t = {last:g}, before "
-            f"time.start + time.horizon = {start:g} + {time.horizon:g}; {whole}"
+            f"{path}, line {table.lines[1]}, column t: the recording ends at t = "
+            f"{instant(last, 6)}, before time.start + time.horizon = {instant(start, 6)} + "
+            f"{time.horizon:g}; {whole}"
         )
     start, stop = max(start, first), min(stop, last)
     if not stop - start > _SHORTEST * max(abs(start), abs(stop)):

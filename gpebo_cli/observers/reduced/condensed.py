@@ -60,19 +60,19 @@ def lean(
     Y, offset = regression.Y.values.copy(), state_map.offset.values.copy()
     estimate, count, factor = found.error_estimate, 0, np.zeros((0, p + 1))
     at_rows: list[tuple[Array, Array]] = []  # times, and the offset there
-    for part, added, at_points, instants, error in beyond(errors, mesh, signals, few, size, solver):
+    for part, added, at_points, t, error in beyond(errors, mesh, signals, few, size, solver):
         estimate = max(estimate, error)
         Y[part] += _projected(Trajectory(added.mesh, added.values[:, :, :r, 0]), mesh, part)
         offset[part] += at_points[:, :, r:]
-        at = np.flatnonzero(np.isin(added.mesh.edges[:-1], instants))
-        t, t_in = added.mesh.edges[at], added.mesh.inside[at, 0]
-        full = regression.Y(t, t_in) + added.values[at, 0, :r, 0]
+        t_in = t + _INSIDE * added.mesh.steps.min()
+        beside = added(t, t_in)[:, :, 0]
+        full = regression.Y(t, t_in) + beside[:, :r]
         own = np.concatenate([regression.psi(t, t_in), full[:, :, None]], axis=2)
         factor = triangular([np.concatenate([factor, own.reshape(-1, p + 1)])])
-        count += len(at)
+        count += len(t)
         if rows:
             at_rows += [
-                (t, state_map.offset(t, t_in) + added.values[at, 0, r:, 0]),
+                (t, state_map.offset(t, t_in) + beside[:, r:]),
                 (mesh.edges[part], offset[part, 0]),
             ]
     duration = float(mesh.edges[-1] - mesh.edges[0])
@@ -126,7 +126,8 @@ def beyond(
     """
     fine = edges(signals.mesh.edges, mesh.edges)
     cuts = np.searchsorted(fine, mesh.edges - 0.5 * _NEAR * mesh.steps.min())
-    first, zeta, samples = 0, np.zeros((len(size), 1)), signals.mesh.edges
+    first, zeta, noise = 0, np.zeros((len(size), 1)), signals.noise
+    samples = signals.mesh.edges if noise is None or noise.rows is None else noise.rows.t
     errors = _interpolated(errors, mesh, solver.tol)
 
     def difference(t: Array, inside: Array) -> Array:

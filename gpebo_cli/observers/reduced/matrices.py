@@ -38,6 +38,7 @@ from gpebo_cli.reduction.form import EquationForm, Equations, HiddenConstraints
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.reduction.structure import follow_dips
 from gpebo_cli.regression.errors import ErrorSystem
+from gpebo_cli.schema import instant
 
 _LACKING = 1e-8  # of the largest singular value of what constraints say of w: it is rounding
 
@@ -377,9 +378,9 @@ def _not_observable(
 ) -> NotObservableError:
     """What is said where the singular value behind Assumption 1 is zero."""
     return NotObservableError(
-        f"plant {system.name}: Assumption 1 (impulse observability) fails at t = {t:.6g}: [ΠA; C] "
-        f"has singular value {smallest:.1e} on the kernel of E; an output that sees the algebraic "
-        "states is needed, or observer.form=strangeness_free"
+        f"plant {system.name}: Assumption 1 (impulse observability) fails at t = {instant(t, 6)}: "
+        f"[ΠA; C] has singular value {smallest:.1e} on the kernel of E; an output that sees the "
+        "algebraic states is needed, or observer.form=strangeness_free"
     )
 
 
@@ -413,7 +414,7 @@ def _eliminate_in_part(
     if (ranks != rank).any():
         raise NotObservableError(
             f"plant {system.name}: Assumption 1 fails, and the rank of [ΠA; C] on the kernel of E "
-            f"changes at t = {t[int(np.argmax(ranks != rank))]:.6g}; use "
+            f"changes at t = {instant(t[int(np.argmax(ranks != rank))], 6)}; use "
             "observer.form=strangeness_free"
         )
     inverse = kernel @ (transpose(Vt[:, :rank]) / sigma[:, None, :rank])

@@ -38,6 +38,7 @@ from gpebo_cli.recordings.hold import Hold, each_of, edges, held, of_outputs
 from gpebo_cli.reduction.form import EquationForm, InputDerivatives
 from gpebo_cli.regression.errors import ErrorSteps
 from gpebo_cli.regression.samples import SampledRegression
+from gpebo_cli.schema import instant
 from gpebo_cli.settings import SolverSettings
 
 _STAGES = 4  # per sample, order 7: beyond what any hold is good for
@@ -139,7 +140,7 @@ class SampledObserver(Formulation):
         if o.split.rank != rank:
             raise ModelError(
                 f"plant {self.system.name}: the rank of E changes from {rank} to {o.split.rank} "
-                f"before t = {t[-1]:.6g}; the observer needs it constant"
+                f"before t = {instant(t[-1], 6)}; the observer needs it constant"
             )
         return o, self.form.driving(t, inside, signals)
 

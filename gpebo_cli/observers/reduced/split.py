@@ -23,6 +23,7 @@ from gpebo_cli.numerics.linalg import (
     transpose,
     without_rounding,
 )
+from gpebo_cli.schema import instant
 
 _TURNED = 8 * float(np.finfo(float).eps)  # of E outside the frame, relative: rounding
 _PROJECTOR_TURNED = 1e-13
@@ -184,9 +185,9 @@ def split_by_svd(
         k = int(np.argmax(ranks != ranks[0]))
         value = sigma[k, min(ranks[k], ranks[0])]
         raise ModelError(
-            f"plant {system.name}: the rank of E changes from {ranks[0]} at t = {t[0]:.6g} to "
-            f"{ranks[k]} at t = {t[k]:.6g} (singular value {value:.1e}); the observer needs it "
-            "constant"
+            f"plant {system.name}: the rank of E changes from {ranks[0]} at t = {instant(t[0], 6)} "
+            f"to {ranks[k]} at t = {instant(t[k], 6)} (singular value {value:.1e}); the observer "
+            "needs it constant"
         )
     n_a = int(ranks[0])
     U1, V1, V2 = U[:, :, :n_a], transpose(Vt)[:, :, :n_a], transpose(Vt)[:, :, n_a:]
@@ -207,8 +208,8 @@ def split_by_svd(
         off = np.abs(P - (basis @ dual) * units / own).max(axis=(1, 2)) >= 10 * _PROJECTOR_TURNED
         if off.any():
             raise ModelError(
-                f"plant {system.name}: the kernel of E turns from t = {t[int(np.argmax(off))]:.6g} "
-                "on; start a run there, or make E smooth"
+                f"plant {system.name}: the kernel of E turns from t = "
+                f"{instant(t[int(np.argmax(off))], 6)} on; start a run there, or make E smooth"
             )
     along = units_along(basis, units)[:, None]
     inverse = along * without_rounding((dual * units / along) @ pinv_E)

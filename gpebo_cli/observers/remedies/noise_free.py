@@ -80,7 +80,8 @@ def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observatio
 def _unsettled(count: int, why: str) -> SolverError:
     return SolverError(
         f"observer.remedy=noise_free does not settle; in round {count} {why}. The noise is too "
-        "large for so long a horizon of this plant: shorten time.horizon, or do without the remedy"
+        "large for so long a horizon of this plant, or the signals are those of another one, or in "
+        "other units: shorten time.horizon, or do without the remedy"
     )
 
 
