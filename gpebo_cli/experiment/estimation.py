@@ -104,12 +104,7 @@ def continuous(
         seen, names = seen_at(known), (regression.parameters, system.states)
         told = dict(zip(system.states, seen[-1], strict=True))
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
-        given = observation.bounds or {}
-        idle = [name for kind in given.values() for name in kind if not told.get(name, True)]
-        observation = replace(observation, bounds={
-            kind: {name: pair for name, pair in pairs.items() if name not in idle}
-            for kind, pairs in given.items()
-        })
+        observation, of_bounds = _bounded_where_known(observation, told)
         estimator = estimators.tuned(estimator, regression)
         try:
             estimation, metrics = _estimate(
@@ -146,10 +141,7 @@ def continuous(
     )
     return _completed(
         found, source, observation, unknown, excitation, estimation, metrics,
-        _gains(observation, estimation), _no_deviations(why) + (
-            f"; without effect, for want of data: observer.bounds of {', '.join(idle)}"
-            if idle else ""
-        ),
+        _gains(observation, estimation), _no_deviations(why) + of_bounds,
     )
 
 
@@ -182,6 +174,22 @@ def _completed(
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
         warnings=lambda: (*warned, *estimation.warnings),
     )
+
+
+def _bounded_where_known(
+    observation: Observation, told: Mapping[str, bool]
+) -> tuple[Observation, str]:
+    """With the bounds of what the data determine, and what the last line says of the others."""
+    given = observation.bounds or {}
+    idle = [name for kind in given.values() for name in kind if not told.get(name, True)]
+    if not idle:
+        return observation, ""
+    kept = {
+        kind: {name: pair for name, pair in pairs.items() if name not in idle}
+        for kind, pairs in given.items()
+    }
+    why = f"; without effect, for want of data: observer.bounds of {', '.join(idle)}"
+    return replace(observation, bounds=kept), why
 
 
 def _with_deviations(
