@@ -173,7 +173,8 @@ def test_metadata_names_pages_versions_and_licence(wheel):
 
 def test_lowest_versions_are_those_that_are_tested():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    tested = dict(re.findall(r"'?([a-z-]+)==([\d.]+?)(?:\.\*)?'? ", (ROOT / ".ci/lowest").read_text()))
+    script = (ROOT / ".ci/lowest").read_text()
+    tested = dict(re.findall(r"'?([a-z-]+)==([\d.]+?)(?:\.\*)?'? ", script))
     for requirement in project["dependencies"]:
         name, lowest = re.match(r"([a-z-]+)>=([\d.]+)", requirement).groups()
         assert tested[name] == lowest
