@@ -333,7 +333,7 @@ BAD = {
     "a repeated time": ("t,V,y\n0,1,2\n0,1,3\n", ["line 3", "column t", "repeats", "line 2"]),
     "a decreasing time": ("t,V,y\n1,1,2\n0.5,1,3\n", ["line 3", "column t", "is before"]),
     "a missing column": ("t,v,y\n0,1,2\n1,1,3\n", ["line 1", "no column V", "mean v?"]),
-    "a line above the header": ("Model,M3\n" + GOOD, ["line 1", "is line 1 the header? It has to"]),
+    "a line above the header": ("Model,M3\n" + GOOD, ["line 1", "line 1 has to be the header"]),
     "line ends of an old Mac": (GOOD.replace("\n", "\r"), ["line 1: a carriage return", "or CRLF"]),
     "a double column": ("t,V,y,y\n0,1,2,2\n", ["line 1", "column y", "2 times"]),
     "nan": ("t,V,y\n0,1,2\n1,nan,3\n", ["line 3", "column V", "'nan'", "finite"]),

@@ -131,7 +131,7 @@ def read_header(
                 f"{source}, line 1: there is no column {name}; {kind} {system.name} needs "
                 f"{needed}, the header has {shown(', '.join(names))}{nearest(name, unused)}; "
                 "data.columns says what a signal is called"
-                + "; is line 1 the header? It has to be" * set(names).isdisjoint(wanted)
+                + "; line 1 has to be the header" * set(names).isdisjoint(wanted)
             )
     factors = {TIME: _SECONDS.get(data.time_unit, 1.0), **scale}
     return Header(
