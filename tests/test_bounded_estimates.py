@@ -15,6 +15,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from gpebo_cli import run
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import bounds as bounds_
 from gpebo_cli.experiment.result import ActiveBound
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -393,3 +394,17 @@ def test_rows_below_a_bound_are_in_groups_that_may_be(end):
         near = bounds_._Groups.of(normals, levels).near(eta, np.ones(2), end)
         assert (below in near) == (below < end)
         assert len(near) < 300
+
+
+def test_a_bound_without_effect_has_none_over_seeds_and_is_a_range_all_the_same():
+    two = {**TANK, "unknowns": {"leak": -0.05, "other": 0.0}, "F": [[-1, -1], [0, 0]]}
+
+    def found(pair):
+        return run(two, observer={"name": "gpebo", "bounds": {"unknowns": {"leak": pair}}},
+                   noise={"name": "gaussian", "outputs": 0.01, "seeds": 3},
+                   time={"horizon": HORIZON, "samples": 21}, estimator={"name": "least_squares"})
+
+    free, held = (found(pair).details.noise for pair in ([None, None], [1, None]))
+    np.testing.assert_allclose(held.bias, free.bias, rtol=1e-9)
+    with pytest.raises(ConfigError, match=r"observer.bounds.unknowns.leak: expected \[low, high\]"):
+        found([1, 0])

@@ -97,19 +97,28 @@ def bounded(
     state_map, p = observation.state_map, observation.regression.p
     if not isinstance(state_map, AffineStateMap):
         raise ConfigError("observer.bounds: the state of this observer is not affine in parameters")
-    check_keys(given, ("states", "unknowns"), "observer.bounds")
     eye = np.eye(p)[:, columns]
-    unknowns = _sides(given.get("unknowns", {}), system.unknowns, "observer.bounds.unknowns")
+    unknowns, states = sides(given, system)
     gram = observation.regression.gram_at(t)[:, columns][:, :, columns]
     least = _FLOOR * np.diag(np.diag(gram[-1]) + np.finfo(float).tiny)
     return BoundedEstimates(
-        estimates, gram + least, state_map, columns, t,
-        _sides(given.get("states", {}), system.states, "observer.bounds.states"),
+        estimates, gram + least, state_map, columns, t, states,
         [
             _Row(side, None, side.sign * eye[side.place], side.sign * side.value)
             for side in unknowns
             if eye[side.place].any()
         ],
+    )
+
+
+def sides(
+    given: Mapping[str, Mapping[str, Sequence[float | None]]], system: DescriptorSystem
+) -> tuple[list[_Side], list[_Side]]:
+    """Of ``observer.bounds``, those of unknowns and of states (ConfigError as :func:`bounded`)."""
+    check_keys(given, ("states", "unknowns"), "observer.bounds")
+    return (
+        _sides(given.get("unknowns", {}), system.unknowns, "observer.bounds.unknowns"),
+        _sides(given.get("states", {}), system.states, "observer.bounds.states"),
     )
 
 

@@ -23,7 +23,7 @@ from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy, doubts
 from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
-from gpebo_cli.experiment.bounds import bounded
+from gpebo_cli.experiment.bounds import bounded, sides
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
 from gpebo_cli.experiment.noise import signal_noise
@@ -104,7 +104,7 @@ def continuous(
         seen, names = seen_at(known), (regression.parameters, system.states)
         told = dict(zip(system.states, seen[-1], strict=True))
         told |= dict(zip(regression.parameters, known.parameters[-1], strict=True))
-        observation, of_bounds = _bounded_where_known(observation, told)
+        observation, of_bounds = _bounded_where_known(observation, system, told)
         estimator = estimators.tuned(estimator, regression)
         try:
             estimation, metrics = _estimate(
@@ -177,11 +177,13 @@ def _completed(
 
 
 def _bounded_where_known(
-    observation: Observation, told: Mapping[str, bool]
+    observation: Observation, system: DescriptorSystem, told: Mapping[str, bool]
 ) -> tuple[Observation, str]:
     """With the bounds of what the data determine, and what the last line says of the others."""
     given = observation.bounds or {}
-    idle = [name for kind in given.values() for name in kind if not told.get(name, True)]
+    of_unknowns, of_states = sides(given, system)
+    names = dict.fromkeys(side.name for side in (*of_unknowns, *of_states))
+    idle = [name for name in names if not told.get(name, True)]
     if not idle:
         return observation, ""
     kept = {

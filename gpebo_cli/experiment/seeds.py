@@ -86,7 +86,7 @@ def over_seeds(
                 yield replace(observation, regression=many)
             return
         for seed in seeds:
-            yield observe(measure(signals, levels, seed))
+            yield replace(observe(measure(signals, levels, seed)), bounds=observation.bounds)
 
     found = list[Array]()
     for own in observed():
