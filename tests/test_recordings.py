@@ -1390,7 +1390,7 @@ def test_functions_that_a_plant_has_for_its_inputs_do_not_count(tmp_path):
         assert found.verdict == results[0].verdict
     follows = {**plant, "A": [["-u"]], "inputs": {"u": "sin(t)", "v": "cos(t)"}}
     source = plant_from_mapping(follows).coefficients
-    found = source.of_recordings
+    found = source.without_inputs
     assert found.taylor(np.ones(1), 1).u.tolist() == [[[np.sin(1.0), 0.0]], [[np.cos(1.0), 0.0]]]
     assert (found.taylor(np.ones(1), 0).A == source.taylor(np.ones(1), 0).A).all()
 

@@ -21,7 +21,7 @@ from gpebo_cli.experiment.noise import noise_levels, signal_noise
 from gpebo_cli.findings import Assumption
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
-from gpebo_cli.model.text import as_recorded
+from gpebo_cli.model.text import driven_from_outside
 from gpebo_cli.numerics.linalg import inverse_or_none
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, Observation, Observer, build
@@ -64,7 +64,7 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
     """
     levels, observer = noise_levels(settings.noise, system), build(settings.observer)
     if settings.data.name == "csv":
-        system = as_recorded(system)
+        system = driven_from_outside(system)
         recording = load(system, settings.data, settings.time, settings.solver.tol)
         noise = signal_noise(levels, recording.rows)
         seen = Measurements(recording.inputs, recording.outputs, noise, recording.derivatives)

@@ -27,7 +27,7 @@ from gpebo_cli.experiment.uncertainty import sampled_deviations
 from gpebo_cli.experiment.verdict import verdict
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.text import as_recorded
+from gpebo_cli.model.text import driven_from_outside
 from gpebo_cli.observers import build, sampling
 from gpebo_cli.recordings.hold import holds
 from gpebo_cli.regression.text import TextRegression
@@ -88,7 +88,7 @@ def run_experiment(
     seconds: dict[str, float] = {}
     stage = partial(_timed, seconds, progress, settings.solver.max_seconds)
     recorded, samples = settings.data.name == "csv", sampling(observer)
-    system = as_recorded(system) if recorded else system
+    system = driven_from_outside(system) if recorded else system
     with stage("read" if recorded else "simulate"):
         read = sources.recorded if recorded else sources.simulated
         file = settings.data.file
@@ -124,7 +124,7 @@ def stream(settings: Settings, system: DescriptorSystem) -> Callable[[float, Arr
             "one"
         )
     deviations = sampled_deviations(levels, None) if settings.uncertainty else None
-    system = as_recorded(system)
+    system = driven_from_outside(system)
     return lambda start, sample: Online(
         settings, system, holds(settings.data.hold, system), start, sample, estimator, deviations
     )

@@ -355,8 +355,8 @@ class TextCoefficients:
         return replace(self, tables=tables, restricted=own)
 
     @cached_property
-    def of_recordings(self) -> TextCoefficients:
-        """The same with zero for inputs that no matrix follows, of which a recording has others."""
+    def without_inputs(self) -> TextCoefficients:
+        """The same with zero for inputs that no matrix follows, where these come from outside."""
         targets, outputs = self.assembly.targets, np.array(self.tape.outputs, dtype=np.intp)
         u = MATRIX_NAMES.index("u")
         others = outputs[targets[:, 0] != u].tolist()
@@ -368,7 +368,7 @@ class TextCoefficients:
         return replace(
             self, assembly=Assembly(tape, targets[kept], tuple(fixed)),
             tables={k: table for k, table in self.tables.items() if k not in idle},
-            restricted=self.restricted and self.restricted.of_recordings,
+            restricted=self.restricted and self.restricted.without_inputs,
         )
 
     @cached_property
@@ -376,12 +376,12 @@ class TextCoefficients:
         return Bounds(self.tape.of([k for k in self.tape.outputs if k in self.tape.of_time]))
 
 
-def as_recorded(system: DescriptorSystem) -> DescriptorSystem:
-    """The plant of a recording: functions of time that its text has for inputs do not count."""
+def driven_from_outside(system: DescriptorSystem) -> DescriptorSystem:
+    """The plant whose inputs are measured: functions of time that it has for them do not count."""
     source = system.coefficients
     if not isinstance(source, TextCoefficients) or system.regression is not None:
         return system
-    return replace(system, coefficients=source.of_recordings)
+    return replace(system, coefficients=source.without_inputs)
 
 
 def switching(source: CoefficientSource) -> Tape | None:
