@@ -83,6 +83,16 @@ def counted(number: int, noun: str) -> str:
     return f"{number} {noun if number == 1 else plural}"
 
 
+def quoting(values: object) -> str:
+    """What to add to a message about a list, an item of which is the end of a call: ``0)``.
+
+    Within brackets and braces a comma ends a value for YAML, that of ``max(y, 0)`` as well.
+    """
+    texts = [v for v in values if isinstance(v, str)] if isinstance(values, list) else []
+    cut = any(text.count(")") > text.count("(") for text in texts)
+    return "; within brackets and braces, quote what has a comma" * cut
+
+
 def instant(t: float, digits: int = 4) -> str:
     """A time in seconds as messages tell it: in digits, a large one to hundredths."""
     return f"{t:.{digits}g}" if abs(t) < 10.0**digits else f"{round(t, 2):.15g}"

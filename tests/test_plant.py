@@ -300,6 +300,11 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "input name is a boolean": (lambda: mine(inputs={False: 1, "I": 0}), "boolean false as a name"),
     "half of a call, which a comma ended": (
         lambda: mine(parameters={"k": "max(t", "1)": None}), "quote what has a comma"),
+    "a call in a row, which a comma ended": (
+        lambda: mine(A=[["max(t", "1)", 1], [0, 1]]), "length 2; within brackets and"),
+    "a call in each row": (
+        lambda: mine(A=[[0, "max(t", "1)*t"]] * 2), "x2); within brackets and braces"),
+    "a call in a list": (lambda: mine(phi=["max(t", "1)", 1]), "x2); within brackets and braces"),
     "parameters is text": (lambda: mine(parameters="R"), "parameters must map names"),
     "parameter is reserved": (lambda: mine(parameters={"exp": 1}), "exp, which is reserved"),
     "parameter is a keyword": (lambda: mine(parameters={"lambda": 1}), "write lambda_"),

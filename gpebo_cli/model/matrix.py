@@ -13,7 +13,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.entries import is_sparse
 from gpebo_cli.model.expressions import shorten
-from gpebo_cli.schema import counted, listed, nearest
+from gpebo_cli.schema import counted, listed, nearest, quoting
 
 Grid = list[list[tuple[int, object]]]  # entries by row, each with its column
 
@@ -81,11 +81,17 @@ def matrix(where: str, value: object, down: Side, across: Side, *, needed: bool)
             plant, _, key = where.rpartition(": ")
             raise ConfigError(
                 f"{plant}: the rows of {key} differ: {key}[0] has length {widths[0]}, "
-                f"{key}[{i}] has length {width}"
+                f"{key}[{i}] has length {width}{_quoting(grid)}"
             )
     if widths[0] != n_columns:
-        raise ConfigError(f"{where} has {counted(widths[0], 'column')} but {across}")
+        raise ConfigError(
+            f"{where} has {counted(widths[0], 'column')} but {across}{_quoting(grid)}"
+        )
     return grid
+
+
+def _quoting(grid: Grid) -> str:
+    return quoting([entry for row in grid for _, entry in row])
 
 
 def per_row(where: str, value: object, rows: Side, must: str, noun: str) -> list[object]:
@@ -94,7 +100,7 @@ def per_row(where: str, value: object, rows: Side, must: str, noun: str) -> list
     if items is None:
         raise ConfigError(f"{where} must {must}, not {brief(value)}")
     if len(items) != len(rows.names):
-        raise ConfigError(f"{where} has {counted(len(items), noun)} but {rows}")
+        raise ConfigError(f"{where} has {counted(len(items), noun)} but {rows}{quoting(items)}")
     return items
 
 

@@ -18,7 +18,7 @@ from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.model.expressions import RESERVED, Expression, no_word, parse, shorten, signal
 from gpebo_cli.model.matrix import Side, brief, is_empty, items_of, matrix, per_row
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
-from gpebo_cli.schema import check_keys, counted, listed, nearest
+from gpebo_cli.schema import check_keys, counted, listed, nearest, quoting
 
 KEYS = (
     "name", "title", "reference", "parameters", "states", "inputs", "unknowns", "outputs",
@@ -206,11 +206,9 @@ def _name(plant: str, key: str, value: object) -> str:
             f"({_YAML_BOOLEAN})"
         )
     if not (isinstance(value, str) and value.isascii() and value.isidentifier()):
-        half = isinstance(value, str) and value.endswith(")")  # of max(y, 1)
         raise ConfigError(
             f"{plant}: {key} has the name {brief(value)}; a name is made of the letters "
-            "a-z, A-Z, digits and _, and starts with no digit"
-            + "; within braces, quote what has a comma" * half
+            f"a-z, A-Z, digits and _, and starts with no digit{quoting([value])}"
         )
     if value in RESERVED:
         raise ConfigError(

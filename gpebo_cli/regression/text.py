@@ -50,7 +50,7 @@ from gpebo_cli.regression.linear import LinearRegression, outer_products
 from gpebo_cli.regression.operators import Operator, OperatorState
 from gpebo_cli.regression.parametrisation import Parametrisation, read_box
 from gpebo_cli.regression.samples import SampledRegression
-from gpebo_cli.schema import check_keys, number, shown
+from gpebo_cli.schema import check_keys, number, quoting, shown
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.signals import Signals, Simulation
 from gpebo_cli.simulation.simulate import simulate
@@ -378,13 +378,16 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
             raise ConfigError(
                 f"{where}: psi[{i}] must be a list with an entry for each of the {system.q} "
                 f"unknowns ({', '.join(system.unknowns)}), not {shown(row)}"
+                f"{quoting(row)}"
             )
         psi += [read(value, f"psi[{i}][{j}]") for j, value in enumerate(row)]
     Y = None
     if right is not None:
         texts = _list(mapping, "Y", where)
         if len(texts) != count:
-            raise ConfigError(f"{where}: Y has {len(texts)} entries and psi has {count} rows")
+            raise ConfigError(
+                f"{where}: Y has {len(texts)} entries and psi has {count} rows{quoting(texts)}"
+            )
         Y = record([read(value, f"Y[{i}]") for i, value in enumerate(texts)], of_time)
     found = tuple(operators.found.values())
     return TextRegression(system, found, record(psi, of_time), Y, recorded, parametrisation)
