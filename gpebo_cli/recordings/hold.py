@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from gpebo_cli.errors import printable
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
-from gpebo_cli.model.expressions import with_others
+from gpebo_cli.model.expressions.bounds import with_others
 from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.schema import known_name
