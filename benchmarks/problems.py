@@ -29,7 +29,7 @@ from benchmarks.measure import (
     say,
     seconds,
 )
-from gpebo_cli.model.expressions import Tape
+from gpebo_cli.model.expressions.tape import Tape
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate

@@ -16,8 +16,10 @@ from test_kernels_jets import tape_of, texts
 
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.model.expressions import Bounds, breakpoints, parse, record, resolved, signal
+from gpebo_cli.model.expressions.bounds import Bounds, breakpoints, resolved
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.model.expressions.syntax import parse, signal
+from gpebo_cli.model.expressions.tape import record
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.simulate import simulate

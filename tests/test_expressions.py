@@ -20,18 +20,12 @@ from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import (
-    Expression,
-    breakpoints,
-    divisors_of,
-    parse,
-    record,
-    shorten,
-    signal,
-    taylor,
-)
 from gpebo_cli.model.expressions import tape as tape_module
+from gpebo_cli.model.expressions.bounds import breakpoints
 from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.expressions.nodes import divisors_of
+from gpebo_cli.model.expressions.syntax import Expression, parse, shorten, signal
+from gpebo_cli.model.expressions.tape import record, taylor
 
 WHERE = "plant mine: A[0][1]"
 # Seconds of this process's own work, whatever else the machine does: what this is there to find

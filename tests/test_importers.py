@@ -33,7 +33,7 @@ from gpebo_cli.importers import from_control, from_file, from_matrices, from_mec
 from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.mechanics import linearise
 from gpebo_cli.importers.netlist import number, read_netlist
-from gpebo_cli.model.expressions import parse
+from gpebo_cli.model.expressions.syntax import parse
 from gpebo_cli.model.plant import plant_from_mapping
 
 PAPER = """electrical circuit of the paper

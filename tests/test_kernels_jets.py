@@ -13,7 +13,8 @@ from kernel_paths import COMPILED, by_both, needs_kernels
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import MATRIX_NAMES
-from gpebo_cli.model.expressions import parse, record
+from gpebo_cli.model.expressions.syntax import parse
+from gpebo_cli.model.expressions.tape import record
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule

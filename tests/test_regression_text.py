@@ -10,8 +10,8 @@ from processes import refused
 from scipy.integrate import solve_ivp
 
 from gpebo_cli import ConfigError, estimators, run
-from gpebo_cli.model.expressions import parse, record
-from gpebo_cli.model.expressions.syntax import signal
+from gpebo_cli.model.expressions.syntax import parse, signal
+from gpebo_cli.model.expressions.tape import record
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time

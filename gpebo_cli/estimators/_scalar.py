@@ -25,11 +25,7 @@ from gpebo_cli.numerics.linalg import (
 )
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, legendre_tail, unresolved
 from gpebo_cli.numerics.refinement import wanted_parts
-from gpebo_cli.regression.linear import (
-    LinearRegression,
-    refuse_overflow,
-    with_realisations,
-)
+from gpebo_cli.regression.linear import LinearRegression, refuse_overflow, with_realisations
 
 Pace = Callable[[Array], Array]  # times (N,) -> what γ is multiplied by there (N,)
 # (times (N,), inside (N,)) -> Δ (N,), 𝐘 (N, p), and σ_min/σ_max of Ω (N,)

@@ -20,7 +20,7 @@ from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.groups import Groups, grouped
 from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.model.expressions import among
+from gpebo_cli.model.expressions.bounds import among
 from gpebo_cli.numerics.linalg import reciprocals, transpose, triangular
 from gpebo_cli.numerics.mesh import Mesh, Sampler
 from gpebo_cli.numerics.radau import radau_rule

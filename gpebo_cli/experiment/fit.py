@@ -205,6 +205,7 @@ def _explained(
     lags = range(1, min(_LAGS, count // 4) + 1)
     if not seen.any() or not lags:
         return fit
+    deviation, steps = np.sqrt(power / count), map(_step, y.T)
     correlation = np.array([
         ((residual[lag:] * residual[:-lag]).sum(axis=0)[seen] / power[seen]).mean() for lag in lags
     ])
@@ -214,15 +215,11 @@ def _explained(
             for name, own in zip(system.outputs, (far & seen).T, strict=True) if own.any()
         ],
         rounded=[
-            (name, step) for name, step, own in zip(
-                system.outputs, map(_step, y.T), np.sqrt(power / count), strict=True
-            ) if own < _ROUNDING * step
+            (name, step) for name, step, own in zip(system.outputs, steps, deviation, strict=True)
+            if own < _ROUNDING * step
         ],
-        coarse=[
-            name for name, missed, own in zip(
-                system.outputs, _missed(t, y, source), np.sqrt(power / count), strict=True
-            ) if missed > own
-        ] if t is samples else (),
+        coarse=tuple(compress(system.outputs, _missed(t, y, source) > deviation))
+        if t is samples else (),
         correlation=correlation, slow=_varies_slowly(residual[:, seen]), lag=stride * step,
         follows=_follows(residual[:, seen], u[::stride]),
         in_matrices=() if observation.errors is not None else tuple(

@@ -27,7 +27,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, IntArray
-from gpebo_cli.model.expressions import with_others
+from gpebo_cli.model.expressions.bounds import with_others
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import SignalNoise

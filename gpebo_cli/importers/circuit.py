@@ -17,7 +17,8 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import Entry, PlantDraft
 from gpebo_cli.importers.netlist import GROUND, Element, Netlist, read_netlist, split_names
-from gpebo_cli.model.expressions import RESERVED, record
+from gpebo_cli.model.expressions.syntax import RESERVED
+from gpebo_cli.model.expressions.tape import record
 from gpebo_cli.model.plant import read_parameters
 from gpebo_cli.schema import nearest, shown
 

@@ -20,7 +20,7 @@ from gpebo_cli.errors import ConfigError
 from gpebo_cli.importers.draft import PlantDraft
 from gpebo_cli.model.archive import MATRICES, MAX_BYTES, read_archive, read_mat
 from gpebo_cli.model.entries import is_sparse
-from gpebo_cli.model.expressions import RESERVED
+from gpebo_cli.model.expressions.syntax import RESERVED
 from gpebo_cli.model.functions import names_of
 from gpebo_cli.reading import open_regular, read_text
 from gpebo_cli.schema import shown

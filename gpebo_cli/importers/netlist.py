@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 from gpebo_cli.errors import ConfigError
-from gpebo_cli.model.expressions import RESERVED
+from gpebo_cli.model.expressions.syntax import RESERVED
 from gpebo_cli.schema import nearest, shown
 
 GROUND = "0"

@@ -43,14 +43,10 @@ def chain(
     return values, int(whole[0])
 
 
-def carried_errors(values: Array, *others: Any) -> tuple[Array, Array]:
+def carried_errors(values: Array, *others: Any) -> Any:
     """In C for few components."""
-    small = _is_small(*values.shape[2:])
-    found: tuple[Array, Array] = (
-        _compiled.carried_errors(values, *others) if small
-        else elements_numpy.carried_errors(values, *others)
-    )
-    return found
+    either = _compiled if _is_small(*values.shape[2:]) else elements_numpy
+    return either.carried_errors(values, *others)
 
 
 series = _compiled.series

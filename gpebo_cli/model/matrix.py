@@ -12,7 +12,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.entries import is_sparse
-from gpebo_cli.model.expressions import shorten
+from gpebo_cli.model.expressions.syntax import shorten
 from gpebo_cli.schema import counted, listed, nearest, quoting
 
 Grid = list[list[tuple[int, object]]]  # entries by row, each with its column

@@ -15,7 +15,7 @@ import numpy as np
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.archive import ARCHIVE, with_archive
 from gpebo_cli.model.descriptor import DescriptorSystem
-from gpebo_cli.model.expressions import RESERVED, Expression, no_word, parse, shorten, signal
+from gpebo_cli.model.expressions.syntax import RESERVED, Expression, no_word, parse, shorten, signal
 from gpebo_cli.model.matrix import Side, brief, is_empty, items_of, matrix, per_row
 from gpebo_cli.model.text import MatrixEntries, coefficients_of
 from gpebo_cli.schema import check_keys, counted, listed, nearest, quoting

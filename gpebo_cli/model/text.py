@@ -21,25 +21,20 @@ from gpebo_cli.model.descriptor import (
     IntArray,
 )
 from gpebo_cli.model.entries import Entries, Places, entries_of
-from gpebo_cli.model.expressions import (
-    Assembly,
+from gpebo_cli.model.expressions.bounds import (
     Bounds,
     Cells,
-    Expression,
-    Tape,
-    aside,
     blurred,
     breakpoints,
-    divisors_of,
-    on_their_side,
-    record,
     resolved,
     resolved_along,
-    shorten,
     switched,
     with_others,
 )
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
+from gpebo_cli.model.expressions.nodes import divisors_of
+from gpebo_cli.model.expressions.syntax import Expression, shorten
+from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, on_their_side, record
 from gpebo_cli.schema import instant
 
 # Shape of a matrix, and its entries by position, row after row; what is not there is 0.

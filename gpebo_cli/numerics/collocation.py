@@ -38,13 +38,7 @@ from gpebo_cli.numerics.errors import (
     through_constraints,
 )
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import (
-    Mesh,
-    Trajectory,
-    equal_lengths,
-    unresolved,
-    unresolved_kinds,
-)
+from gpebo_cli.numerics.mesh import Mesh, Trajectory, equal_lengths, unresolved, unresolved_kinds
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem, at_points
 from gpebo_cli.numerics.radau import ComplexArray, RadauRule, differentiation_schur
 from gpebo_cli.numerics.refinement import refine

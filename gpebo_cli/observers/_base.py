@@ -22,7 +22,7 @@ from gpebo_cli.model.descriptor import (
     IntArray,
     differential_order,
 )
-from gpebo_cli.model.expressions import on_their_side
+from gpebo_cli.model.expressions.tape import on_their_side
 from gpebo_cli.model.text import sided
 from gpebo_cli.numerics.mesh import Mesh, Samples, Trajectory, beside_edges
 from gpebo_cli.numerics.rows import Rows

@@ -29,7 +29,9 @@ import numpy as np
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.findings import Assumption
 from gpebo_cli.model.descriptor import Array, BoolArray, Changed, Coefficients, DescriptorSystem
-from gpebo_cli.model.expressions import parse, taylor, with_others
+from gpebo_cli.model.expressions.bounds import with_others
+from gpebo_cli.model.expressions.syntax import parse
+from gpebo_cli.model.expressions.tape import taylor
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from gpebo_cli.errors import printable
 from gpebo_cli.model.descriptor import Array, BoolArray, CoefficientSource, DescriptorSystem
-from gpebo_cli.model.expressions import with_others
-from gpebo_cli.numerics.mesh import Mesh, legendre_tail, signal_scale
+from gpebo_cli.model.expressions.bounds import with_others
+from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, Mesh, legendre_tail, signal_scale
 from gpebo_cli.numerics.radau import RadauRule, radau_rule
 from gpebo_cli.schema import known_name
 
@@ -30,7 +30,6 @@ Held = Callable[[Array, Array], Array]
 Hold = str | tuple[str, ...]  # of all signals, or of each its own
 
 _STAGES = (3, 4, 6, 9, 12, 16)  # candidates for the mesh of a recording
-_FIRST_ELEMENTS = 24  # at least this many, as for a simulation
 _PROBED = 64  # elements on which the plant's matrices are looked at
 _FASTEST = 8.0  # of a mode, per element, that decides how many nodes one has
 _SAME = 1e-13  # slopes that differ by less than this share of the signal's size are the same
@@ -132,7 +131,7 @@ def recording_mesh(
             every = np.concatenate([[start], t[inner], [stop]])
             knots = np.union1d(knots, _merged(spline, every, rule, tol))
         coarse = Mesh(edges(knots, cuts), rule)
-        equal = np.rint(_FIRST_ELEMENTS * coarse.steps / (stop - start)).astype(np.intp)
+        equal = np.rint(FIRST_ELEMENTS * coarse.steps / (stop - start)).astype(np.intp)
         mesh, _ = coarse.split(np.maximum(1, equal))
         parts = _parts(source, signal, mesh, tol)
         candidates.append((mesh.size * (rule.stages + 1) * parts, mesh))
@@ -160,7 +159,7 @@ def _merged(signal: Held, knots: Array, rule: RadauRule, tol: float) -> Array:
     count = len(knots) - 1
     wanted = np.ones(count + 1, dtype=bool)
     done = np.zeros(count, dtype=bool)  # samples whose block is decided
-    level = int(np.log2(max(count // _FIRST_ELEMENTS, 1)))
+    level = int(np.log2(max(count // FIRST_ELEMENTS, 1)))
     for length in 2 ** np.arange(level, 0, -1):
         first = np.arange(0, count - length + 1, length)
         first = first[~done[first]]

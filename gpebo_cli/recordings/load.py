@@ -9,7 +9,8 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem, check_sizes
-from gpebo_cli.model.expressions import aside, switched, with_others
+from gpebo_cli.model.expressions.bounds import switched, with_others
+from gpebo_cli.model.expressions.tape import aside
 from gpebo_cli.model.text import TextCoefficients, sided
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, beside_edges
 from gpebo_cli.numerics.radau import radau_rule

@@ -75,12 +75,8 @@ def balance_entries(
     """:func:`balance` of n equations by entries of these sizes (e,): 0 of E or 1 of A, i and j."""
     kind, i, j = places
     counts = np.where(kind == 0, mass, 1.0)
-    return _scaling(_factors(sizes, i, j, kind - 1, (n, n), counts)[0])
-
-
-def _scaling(factors: Array) -> Scaling:
-    """From the logarithms of the factors (2 n + 1,)."""
-    n, powers = len(factors) // 2, np.exp2(np.rint(factors / np.log(2.0)))
+    factors, *_ = _factors(sizes, i, j, kind - 1, (n, n), counts)
+    powers = np.exp2(np.rint(factors / np.log(2.0)))
     return Scaling(powers[:n], powers[n:-1], float(powers[-1]))
 
 

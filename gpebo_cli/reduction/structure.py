@@ -17,7 +17,7 @@ from gpebo_cli import kernels
 from gpebo_cli.errors import ModelError
 from gpebo_cli.kernels.structure_numpy import frobenius_norm, scaled
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray, distinct
-from gpebo_cli.model.expressions import halved
+from gpebo_cli.model.expressions.bounds import halved
 from gpebo_cli.numerics.linalg import inverse_or_none, transpose
 from gpebo_cli.numerics.mesh import FIRST_ELEMENTS, initial_edges
 from gpebo_cli.reduction.scaling import Scaling, balance

@@ -11,7 +11,7 @@ import numpy as np
 
 from gpebo_cli.kernels import elements
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
-from gpebo_cli.model.expressions import halved, with_others
+from gpebo_cli.model.expressions.bounds import halved, with_others
 from gpebo_cli.numerics.collocation import merged, solve
 from gpebo_cli.numerics.linalg import largest_over_time, transpose
 from gpebo_cli.numerics.mesh import SHARE, Mesh, Trajectory, joined, unresolved_kinds

@@ -12,7 +12,7 @@ import numpy as np
 
 from gpebo_cli.kernels.laws_numpy import mean_decay
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import Tape
+from gpebo_cli.model.expressions.tape import Tape
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.samples import delayed

@@ -18,8 +18,9 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import Bounds, Tape
+from gpebo_cli.model.expressions.bounds import Bounds
 from gpebo_cli.model.expressions.intervals import Interval
+from gpebo_cli.model.expressions.tape import Tape
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.schema import number, shown
 

@@ -22,22 +22,17 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.expressions import (
+from gpebo_cli.model.expressions import nodes
+from gpebo_cli.model.expressions.bounds import (
     Bounds,
-    Expression,
-    Tape,
-    aside,
     breakpoints,
-    nodes,
-    parse,
-    record,
     resolved,
     resolved_along,
     switched,
 )
 from gpebo_cli.model.expressions.nodes import Node
-from gpebo_cli.model.expressions.syntax import signal
-from gpebo_cli.model.expressions.tape import UNKNOWN
+from gpebo_cli.model.expressions.syntax import Expression, parse, signal
+from gpebo_cli.model.expressions.tape import UNKNOWN, Tape, aside, record
 from gpebo_cli.model.plant import named_values, plant_from_mapping, read_parameters
 from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.linalg import largest_over_time

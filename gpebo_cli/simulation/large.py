@@ -17,14 +17,7 @@ from gpebo_cli.numerics import series
 from gpebo_cli.numerics.collocation import LinearSolution
 from gpebo_cli.numerics.errors import EPS, NOTHING, TINY, VALUE
 from gpebo_cli.numerics.linalg import largest_over_time
-from gpebo_cli.numerics.mesh import (
-    SHARE,
-    Kind,
-    Mesh,
-    Trajectory,
-    legendre_tail,
-    unresolved,
-)
+from gpebo_cli.numerics.mesh import SHARE, Kind, Mesh, Trajectory, legendre_tail, unresolved
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.refinement import RoundingError

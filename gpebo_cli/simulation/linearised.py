@@ -20,7 +20,8 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, Coefficients, DescriptorSystem, IntArray
-from gpebo_cli.model.expressions import Tape, aside, on_their_side, switched, with_others
+from gpebo_cli.model.expressions.bounds import switched, with_others
+from gpebo_cli.model.expressions.tape import Tape, aside, on_their_side
 from gpebo_cli.model.text import TextCoefficients, sided, switching
 from gpebo_cli.numerics.linalg import taylor_product
 from gpebo_cli.numerics.mesh import Trajectory, signal_scale

@@ -11,33 +11,3 @@ Both sides of a ``step`` are always computed, so ``sqrt(t - 1)*step(t - 1)`` fai
 intermediate value that overflows is refused even where the end result would be finite again, so
 ``1/(1 + exp(500*t))`` fails for t > 1.4 (``tanh`` does not).
 """
-
-from gpebo_cli.model.expressions.bounds import (
-    Bounds,
-    Cells,
-    among,
-    blurred,
-    breakpoints,
-    halved,
-    resolved,
-    resolved_along,
-    switched,
-    with_others,
-)
-from gpebo_cli.model.expressions.nodes import divisors_of
-from gpebo_cli.model.expressions.syntax import (
-    RESERVED,
-    Expression,
-    no_word,
-    parse,
-    shorten,
-    signal,
-)
-from gpebo_cli.model.expressions.tape import Assembly, Tape, aside, on_their_side, record, taylor
-
-__all__ = [
-    "RESERVED", "Assembly", "Bounds", "Cells", "Expression", "Tape", "among", "aside",
-    "blurred", "breakpoints", "divisors_of", "halved", "no_word", "on_their_side", "parse",
-    "record", "resolved", "resolved_along", "shorten", "signal", "switched", "taylor",
-    "with_others",
-]

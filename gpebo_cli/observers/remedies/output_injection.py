@@ -27,7 +27,8 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, DescriptorSystem
-from gpebo_cli.model.expressions import parse, taylor
+from gpebo_cli.model.expressions.syntax import parse
+from gpebo_cli.model.expressions.tape import taylor
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, Trajectory, joined
 from gpebo_cli.numerics.radau import RadauRule

@@ -23,7 +23,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.model.expressions import with_others
+from gpebo_cli.model.expressions.bounds import with_others
 from gpebo_cli.numerics.collocation import solve
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
