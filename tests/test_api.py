@@ -174,7 +174,7 @@ def test_what_is_printed_is_what_the_command_prints(circuit, tmp_path):
 
 def test_the_folder_is_the_command_lines_byte_for_byte(circuit, tmp_path):
     circuit.save(tmp_path / "python", figures="gram")
-    gpebo(
+    inprocess.gpebo(  # which draws its own figure
         "run", "estimator=drem", "estimator.gamma=[1e8,1e10]", "time.horizon=8",
         "time.samples=201", "figures=[gram]", "hydra.run.dir=command", cwd=tmp_path,
     )

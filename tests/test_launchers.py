@@ -96,7 +96,7 @@ def test_every_launcher_makes_the_same_table(tmp_path, basic, launcher):
 def test_a_worker_that_dies_leaves_a_sweep_that_can_be_resumed(tmp_path):
     if reason := why_not("joblib"):
         pytest.skip(reason)
-    many = ["run", "-m", "estimator.gamma=logspace(6,9,8)", *FAST]
+    many = ["run", "-m", "estimator.gamma=logspace(6,9,6)", *FAST]
     words = [*many, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "hydra.sweep.dir=sweep"]
     with begin(*words, cwd=tmp_path) as process:
         wait_for(tmp_path / "sweep", "*/result.json", 1)
@@ -125,6 +125,7 @@ def test_a_dead_child_that_nobody_collects_is_noticed(monkeypatch):
     """What joblib leaves of a worker that died while it was sending a result."""
     # Its living children are others' here: the process behind the `gpebo` of all tests is one.
     monkeypatch.setattr(gpebo_cli.cli.workers, "end_children", lambda: None)
+    monkeypatch.setattr(gpebo_cli.cli.workers, "_FAREWELL", 0.1)
     ended, started = threading.Event(), []
 
     def launch():
