@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gpebo_cli import run
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
@@ -131,3 +132,25 @@ def test_estimates_have_settled_where_they_are_within_two_deviations_of_the_end(
     for name, (seconds,) in found.items():
         assert expected[name] - 0.1 - 1e-9 <= seconds <= expected[name] + 1e-9
         assert name not in {"a", "e0_x"} or told == "filter" or 0.5 < seconds < 4.0
+
+
+def test_states_that_are_rounding_count_as_zero():
+    """p1 and p3 are held where they are: simulated, they and their velocities are 1e-18."""
+    E, A = np.diag([1.0] * 6 + [0.0] * 2), np.zeros((8, 8))
+    E[3:6, 3:6] = [[2, 1, 0], [1, 3, 1], [0, 1, 2]]
+    A[:3, 3:6], A[3, 6], A[5, 7], A[6, 0], A[7, 2] = np.eye(3), 1, 1, 1, 1
+    A[3:6, :3] = [[-67, -69, 69], [-70, -2, 2], [70, 2, 68]]
+    A[3:6, 3:6] = [[1.5, 1.5, -1.5], [-3, -3, 3], [3, 3, -3]]
+    states = ["p1", "p2", "p3", "v1", "v2", "v3", "l1", "l2"]
+    result = run({
+        "name": "held", "states": states, "outputs": ["y"], "E": E.tolist(), "A": A.tolist(),
+        "C": [[0, 1, 0, 0, 0, 0, 0.01, 0]], "initial_state": [0, 0.1, 0, 0, 0.2, 0, 0, 0],
+    }, estimator={"name": "least_squares", "f0": 1e-6}, time={"horizon": 1})
+    norm = np.sqrt(sum(
+        (result.errors[s][0] / np.abs(result[s]).max()) ** 2 for s in ("p2", "v2", "l1", "l2")
+    ))
+    t, case = result.estimates_t, result.cases[0]
+    after = t[np.flatnonzero(norm > 0.01 * norm[0])[-1] + 1]
+    assert case["seconds_to_1pct_states"] == pytest.approx(after, abs=2e-3)
+    assert case["rms_error_states"] == pytest.approx(np.sqrt(np.trapezoid(norm**2, t)), rel=1e-2)
+    assert case["seconds_to_1pct_p3"] == 0.0

@@ -114,8 +114,22 @@ def test_the_rank_condition_has_the_rank_of_its_matrix(C):
     whole = np.block([[E, A], [np.zeros(3), np.array(C)], [np.zeros((3, 3)), E]])
     told = found(lti(
         states=["a", "b", "c"], E=E.tolist(), A=A.tolist(), C=[C], initial_state=[1, 1, 0],
-    ), form="strangeness_free")["Rank condition D2"]
+    ), form="given")["Rank condition D2"]
     assert told.evidence == {"rank": np.linalg.matrix_rank(whole), "needed": 2 + 3}
+
+
+@pytest.mark.parametrize(("observer", "told"), [
+    ({"name": "gpebo"}, False), ({"name": "gpebo", "form": "given"}, True),
+    ({"name": "kalman_bucy"}, False), ({"name": "none"}, False),
+])
+def test_the_rank_condition_is_that_of_the_form_as_given(observer, told):
+    """0 = a − b, b' = c: no output sees c, which the strangeness-free form has from b' = a'."""
+    blind = lti(
+        states=["a", "b", "c"], E=[[1, 0, 0], [0, 1, 0], [0, 0, 0]],
+        A=[[-1, 0, 0], [0, 0, 1], [1, -1, 0]], C=[[1, 0, 0]], initial_state=[1, 1, 0],
+    )
+    failed = [name for name, a in found(blind, **observer).items() if not a.holds]
+    assert failed == ["Rank condition D2", "Assumption 1"] * told
 
 
 def test_the_pencil_is_judged_in_no_units():

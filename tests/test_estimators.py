@@ -496,6 +496,16 @@ def test_lion_takes_rows_in_turn_but_those_of_rounding(sizes, taken):
     np.testing.assert_array_equal(rows @ made.psi(at), made.psi(at)[:, taken])
 
 
+@pytest.mark.parametrize("observer", [{}, {"sample_time": 0.1}])
+def test_lion_refuses_equal_filters_of_one_row(observer):
+    """Two rows of Ω would be the same, and Δ rounding, for which no γ is large enough."""
+    sine = {"name": "sine", "unknowns": {"a": 1, "b": 2}, "signals": {"s": "sin(t)"}}
+    law, settings = {"name": "lion", "lambda": 1}, {"time": {"horizon": 2}, "observer": observer}
+    with pytest.raises(ConfigError, match="need rates that differ, because Δ is zero otherwise"):
+        api_run(regression={**sine, "psi": [["s", "1"]]}, estimator=law, **settings)
+    api_run(regression={**sine, "psi": [["s", "1"], ["1", "s"]]}, estimator=law, **settings)
+
+
 def test_ls_drem_delta_is_the_reference_one():
     _, observation = observed(shipped("circuit"))
     rows = reference("circuit")["at"]

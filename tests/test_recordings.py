@@ -1454,3 +1454,25 @@ def test_a_folder_and_too_many_cells_are_no_recording(tmp_path, monkeypatch):
     monkeypatch.setattr("gpebo_cli.recordings.table._MOST_CELLS", frame.size - 1)
     with pytest.raises(ConfigError, match=f"has {frame.size} cells; at most {frame.size - 1} are"):
         run(STEPPED, data=tmp_path / "a.parquet")
+
+
+def test_an_input_that_nobody_knows_is_a_state_without_an_equation():
+    """x' = −x + dist, y = (x + dist, x), and 0 = x + dist − y₁ as an output that is zero."""
+    t = np.linspace(0.0, 5.0, 101)
+    x = (np.cos(t) + np.sin(t) + np.exp(-t)) / 2.0
+    rows = {"t": t, "y1": x + np.cos(t), "y2": x, "u": -x - np.cos(t), "nothing": 0.0 * t}
+    plant = {
+        "name": "disturbed", "states": ["x", "dist"], "initial_state": [1, 1],
+        "E": [[1, 0], [0, 0]], "A": [[-1, 1], [0, 0]],
+    }
+    for more in (
+        {"outputs": ["y1", "y2"], "C": [[1, 1], [1, 0]]},
+        {"outputs": ["nothing", "y2"], "C": [[1, 1], [1, 0]], "D": [[1], [0]],
+         "inputs": {"u": "0"}, "B": [[0], [0]]},
+    ):
+        data = {"frame": pd.DataFrame(rows), "hold": "cubic"}
+        result = run({**plant, **more}, data=data)
+        for name, truth in (("x", x), ("dist", np.cos(t))):
+            found = np.interp(4.0, result.estimates_t, result.estimates[name][0])
+            assert found == pytest.approx(np.interp(4.0, t, truth), abs=1e-4)
+        assert result.estimates["e0_x"][0, -1] == pytest.approx(-1.0, abs=1e-4)

@@ -285,3 +285,26 @@ def test_a_start_beyond_all_numbers_is_refused_in_one_line():
     )
     with pytest.raises(SolverError, match="beyond all numbers at t = 0"):
         run(content, solver="ivp", time={"horizon": 1, "samples": 11})
+
+
+def test_terms_that_filters_have_of_the_past_are_unknowns_of_their_own():
+    """Two sines behind four filters of rate 5; and the same mixed by hand with a delay."""
+    past = [f"t**{k}*exp(-5*t)" for k in range(4)]
+    chains = ("hhhh", "hhll", "llll")
+    Y, a, b = ("".join(f"{op}p(" for op in ops) + "y" + ", 5)" * 4 for ops in chains)
+    common = {"name": "two", "signals": {"y": "1.2*sin(2*t + pi/3) + 2*sin(3*t + pi/4)"}}
+    made = run(regression={
+        **common, "unknowns": {"th1": 13, "th2": 36, **{f"c{k}": 0 for k in range(4)}},
+        "Y": [Y], "psi": [[f"-{a}", f"-{b}", *past]],
+    }, time={"horizon": 4})
+    found = [made.estimates[name][0, -1] for name in ("th1", "th2")]
+    assert found == pytest.approx([13, 36], rel=1e-9)
+    Y_d, a_d, b_d = (f"delay({text}, 0.3)" for text in (Y, a, b))
+    delta = f"{a}*{b_d} - {b}*{a_d}"
+    made = run(regression={
+        **common, "unknowns": {"th1": 13, "th2": 36},
+        "Y": [f"{b}*{Y_d} - {b_d}*{Y}", f"{a_d}*{Y} - {a}*{Y_d}"],
+        "psi": [[delta, 0], [0, delta]],
+    }, estimator={"name": "gradient", "gamma": 10}, time={"horizon": 7})
+    found = [made.estimates[name][0, -1] for name in ("th1", "th2")]
+    assert found == pytest.approx([13, 36], rel=1e-8)

@@ -205,7 +205,7 @@ GOOD = {"name": "r", "unknowns": {"a": 1.0}, "signals": {"u": "sin(t)"}, "Y": ["
     ({"Y": ["lp(u, u)"]}, "its rate λ must be a positive number"),
     ({"Y": ["lp(u, u**3)"]}, "its rate λ must be a positive number"),
     ({"Y": ["delay(u, -1)"]}, "the delay must be a positive number"),
-    ({"Y": ["lp(d(t*t), 1)"]}, "d(.) cannot stand inside"),
+    ({"Y": ["lp(d(t*t), 1)"]}, "d(.) cannot stand inside; make what has it a signal"),
     ({"Y": ["a*u"]}, "a is an unknown and cannot be used here"),
     ({"Y": ["lpp(u, 1)"]}, "there is no function 'lpp'; did you mean lp?"),
     ({"Phi": 1}, "unknown key 'Phi'; did you mean"),

@@ -77,7 +77,7 @@ def examine(settings: Settings, system: DescriptorSystem) -> Examination:
         return Examination((Assumption("Solvability", _SOLVABILITY, False, {"found": str(error)}),))
     found = of_simulation(system, simulation)
     if observer is None:
-        return Examination(tuple(found))
+        return Examination(needed(found))
     if any(jump.impulses.any() for _, _, jump in simulation.jumps):
         found.append(
             Assumption("No impulses", "jumps of the input put no impulse into the state", False, {})
@@ -110,7 +110,7 @@ def _of_observer(
     if isinstance(observer, Gpebo) and observer.form == "auto":
         found = [_with_other_form(a, observer, system, seen, settings) for a in found]
     return Examination(
-        tuple(found), times, excitation,
+        needed(found), times, excitation,
         _per_unit(observation, excitation.known, settings, system, seen, times),
         observation.unseen,
     )
@@ -176,7 +176,14 @@ def _named(error: GpeboError) -> str:
     return found[0] if found else "Rank of E" if "rank of E" in str(error) else "Observer"
 
 
+_RANK_CONDITION = "Rank condition D2"
 _SOLVABILITY = "uniquely solvable, with constant characteristic values (μ, d, a)"
+
+
+def needed(found: Sequence[Assumption]) -> tuple[Assumption, ...]:
+    """Without a rank condition that fails where no observer takes the equations as given."""
+    given = any(a.evidence.get("form") == "given" for a in found)
+    return tuple(a for a in found if a.holds or given or a.name != _RANK_CONDITION)
 
 
 def of_simulation(system: DescriptorSystem, simulation: Simulation) -> list[Assumption]:
@@ -241,7 +248,7 @@ def _of_constant_system(system: DescriptorSystem, simulation: Simulation) -> lis
             {"largest_smallest_singular_value": regular},
         ),
         Assumption(
-            "Rank condition D2", "rank [E A; 0 C; 0 E] = rank E + n (constant coefficients)",
+            _RANK_CONDITION, "rank [E A; 0 C; 0 E] = rank E + n (constant coefficients)",
             whole == rank + n,
             {"rank": whole, "needed": rank + n},
         ),

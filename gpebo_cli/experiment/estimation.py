@@ -22,7 +22,7 @@ from gpebo_cli.evidence.knowledge import Knowledge
 from gpebo_cli.evidence.metrics import NAMES as METRICS
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy, doubts
-from gpebo_cli.experiment.assumptions import Observed, of_observation, visible, warnings
+from gpebo_cli.experiment.assumptions import Observed, needed, of_observation, visible, warnings
 from gpebo_cli.experiment.bounds import bounded, sides
 from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
@@ -170,7 +170,7 @@ def _completed(
     notes += recording.note if recording else ""
     return replaced(
         found, excitation=excitation, estimation=estimation, metrics=metrics,
-        assumptions=lambda: (*of_source(), *of_observer()),
+        assumptions=lambda: needed((*of_source(), *of_observer())),
         verdict=lambda: "; ".join([told() + notes, *warned, *estimation.warnings]),
         warnings=lambda: (*warned, *estimation.warnings),
     )

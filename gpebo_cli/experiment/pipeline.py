@@ -17,6 +17,7 @@ import numpy as np
 from gpebo_cli import estimators
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment import limits, several, sources
+from gpebo_cli.experiment.assumptions import needed
 from gpebo_cli.experiment.estimation import at_samples, continuous
 from gpebo_cli.experiment.limits import Pace, paced
 from gpebo_cli.experiment.noise import noise_levels
@@ -99,7 +100,7 @@ def run_experiment(
     of_source = source.assumptions
     result = RunResult(
         settings=settings, system=system, simulation=source.simulation,
-        recording=source.recording, timings=seconds, assumptions=lambda: tuple(of_source()),
+        recording=source.recording, timings=seconds, assumptions=lambda: needed(of_source()),
         verdict=source.verdict,
     )
     if observer is None or estimator is None:

@@ -92,9 +92,13 @@ def simulated(
             f"{state}; an observer cannot be driven by it. Use a continuous input, or "
             "observer=none to simulate only"
         )
+    states = simulation.signals.states
+    if simulation.state_errors is not None:
+        # A state with an error of its own size is rounding: estimates are compared with zero.
+        states = replace(states, values=states.values * (simulation.state_errors < 1.0))
     return Source(
         t=t, levels=levels, inputs=measured.inputs, outputs=measured.outputs,
-        states=simulation.signals.states, theta=system.theta_at,
+        states=states, theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, levels.inputs == 0),

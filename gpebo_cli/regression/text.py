@@ -304,7 +304,10 @@ class _Operators:
         if not number.is_number or (name != "integral" and number.value <= 0.0):
             raise nodes.FoldError(f"{name}: {what} must be a positive number")
         if argument.derivatives:
-            raise nodes.FoldError(f"{name}: d(.) cannot stand inside; use hp for a derivative")
+            raise nodes.FoldError(
+                f"{name}: d(.) cannot stand inside; make what has it a signal, or use hp, whose "
+                "derivative is filtered"
+            )
         tape = record([Expression(argument, name, f"argument of {name}")], self._signals)
         key = (name, tape.instructions, number.value)
         self.found.setdefault(key, Operator(name, tape, number.value))
