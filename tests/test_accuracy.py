@@ -10,6 +10,7 @@ import pytest
 from gpebo_cli import run
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.experiment import accuracy
+from gpebo_cli.experiment.sources import _without_rounding
 from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import AffineStateMap
@@ -154,3 +155,17 @@ def test_states_that_are_rounding_count_as_zero():
     assert case["seconds_to_1pct_states"] == pytest.approx(after, abs=2e-3)
     assert case["rms_error_states"] == pytest.approx(np.sqrt(np.trapezoid(norm**2, t)), rel=1e-2)
     assert case["seconds_to_1pct_p3"] == 0.0
+
+
+def test_states_are_no_zeros_where_rounding_has_grown():
+    """Of those of a chaotic plant nothing is known, but they are as large as others."""
+    mesh, units = Mesh(np.array([0.0, 1.0]), radau_rule(3)), np.array([1.0, 1e-3, 1e3])
+    values = np.ones((1, 4, 3)) * units
+    values[..., 2] *= 1e-18
+    simulation = SimpleNamespace(
+        signals=SimpleNamespace(states=Trajectory(mesh, values)),
+        structure=SimpleNamespace(scaling=SimpleNamespace(columns=units)),
+        state_errors=np.array([1e-9, 15.0, 15.0]),
+    )
+    found = _without_rounding(simulation).values
+    assert (found == values * [1.0, 1.0, 0.0]).all()

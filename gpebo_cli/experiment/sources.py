@@ -92,18 +92,35 @@ def simulated(
             f"{state}; an observer cannot be driven by it. Use a continuous input, or "
             "observer=none to simulate only"
         )
-    states = simulation.signals.states
-    if simulation.state_errors is not None:
-        # A state with an error of its own size is rounding: estimates are compared with zero.
-        states = replace(states, values=states.values * (simulation.state_errors < 1.0))
     return Source(
         t=t, levels=levels, inputs=measured.inputs, outputs=measured.outputs,
-        states=states, theta=system.theta_at,
+        states=_without_rounding(simulation), theta=system.theta_at,
         assumptions=partial(of_simulation, system, simulation),
         verdict=simulation_verdict(simulated) + functions_note(system, simulated),
         derivatives=InputDerivatives.of_plant(system, levels.inputs == 0),
         true=simulation.signals, simulation=simulated,
     )
+
+
+def _without_rounding(simulation: Simulation) -> Trajectory:
+    """The states that estimates are compared with; one that is nothing but rounding is zero.
+
+    Constraints that hold a state at zero leave 1e-18 of it, and its error is no smaller. Where all
+    states are as uncertain, rounding has grown, and none of them is zero.
+    """
+    states, errors = simulation.signals.states, simulation.state_errors
+    if errors is None or (errors < 1.0).all():
+        return states
+    size = largest_over_time(states.values, 2)
+    zero = (errors >= 1.0) & (size < _nothing(simulation, size))
+    return replace(states, values=np.where(zero, 0.0, states.values))
+
+
+def _nothing(simulation: Simulation, size: Array) -> Array:
+    """Below what a state is nothing beside the others, whose largest values are size (n,)."""
+    columns = simulation.structure.scaling.columns
+    units = columns if len(columns) else np.ones(len(size))
+    return np.asarray(_NEVER * units * (size / units).max(initial=0.0))
 
 
 def recorded(
@@ -217,8 +234,7 @@ def _sample_simulation(
     sampler = signals.mesh.sampler(t)
     start = float(signals.mesh.edges[0])
     size = largest_over_time(signals.states.values, 2)
-    units = structure.scaling.columns if len(structure.scaling.columns) else np.ones(system.n)
-    size = np.maximum(size, _NEVER * units * (size / units).max(initial=0.0))
+    size = np.maximum(size, _nothing(simulation, size))
     jumps = [
         change
         for when, before, jump in simulation.jumps
