@@ -414,10 +414,10 @@ def _parametrisation(
     names = tuple(unknowns)
     truth = np.array([number(unknowns[k], f"{where}: unknowns.{k}", "finite") for k in names])
     low, high = read_box(mapping.get("box"), names, where)
-    for name, value, ends in zip(names, truth.tolist(), zip(low, high, strict=True), strict=True):
+    for name, value, ends in zip(names, truth.tolist(), np.c_[low, high].tolist(), strict=True):
         if not ends[0] <= value <= ends[1]:
             raise ConfigError(
-                f"{where}: unknowns.{name} = {value:g} is not within its box, {shown([*ends])}"
+                f"{where}: unknowns.{name} = {value:g} is not within its box, {shown(ends)}"
             )
     known = {name: signal(name, k, "an unknown") for k, name in enumerate(names)}
     entries = _list(mapping, "S", where)
