@@ -54,6 +54,14 @@ def test_eigenvalues_of_the_circuit_match_the_reference():
     assert found.is_ie
 
 
+@pytest.mark.parametrize("horizon", [0.5, 80.0])
+def test_a_window_is_a_tenth_of_the_horizon_or_what_is_said(horizon):
+    made = regression(lambda t: np.stack([1 + 0 * t, t], axis=-1), [1.0, 2.0], horizon)
+    t = np.array([0.0, horizon])
+    assert assess(made, t, ExcitationSettings()).window == pytest.approx(horizon / 10, rel=1e-15)
+    assert assess(made, t, ExcitationSettings(window=3.0)).window == 3.0
+
+
 def test_eigenvalues_and_window_against_quadrature():
     found = assess(CLEAN, T, ExcitationSettings(rho=0.5, window=2.5))
     for k in (40, 120, 200):
