@@ -301,6 +301,16 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
         information(large, 1.0, f0, 10.0, bound)  # of 1e6 by 1e-6 rounding leaves nothing
 
 
+def test_what_of_G_is_rounding_early_in_an_element_is_no_question_of_the_unit_of_time():
+    """G is ∫ψᵀψ, in which the unit of time stands once, and in units of parameters by its root."""
+    found = []
+    for unit in 1e-6, 1.0, 1e6:
+        made = regression(lambda t, unit=unit: three(t / unit), ETA, 10.0 * unit)
+        told = information(made, 1.0, None, 0.0, None).at(np.array([1e-3, 0.01, 0.06]) * unit)
+        found.append(told.units / np.sqrt(unit))
+    np.testing.assert_allclose(found, np.broadcast_to(found[1], np.shape(found)), rtol=1e-6)
+
+
 def test_what_is_mixed_keeps_the_digits_of_small_columns():
     """Of Y = ψη without noise 𝐘/Δ is η, though eigenvectors of G hide the small column's share."""
     units, t = np.array([1.0, 1e-6, 1.0]), np.array([5.0, 9.0])
