@@ -29,6 +29,7 @@ from gpebo_cli.estimators._scalar import (
     lion_rows,
     low_pass,
     mix,
+    resolved_for,
     scalar_law,
     scalar_path,
 )
@@ -1137,6 +1138,13 @@ def test_a_step_of_the_power_law_is_resolved_to_its_digits(delta, digits, error,
     change, nodes = np.array([0.0, error, 0.0]), np.ones((3, 5))
     found = _resolved(path, values, change, delta * nodes, digits * nodes)
     np.testing.assert_array_equal(found, [good, good, True])
+
+
+def test_elements_that_a_large_gain_asks_for_are_no_more_than_may_be(monkeypatch):
+    (path,) = estimate("drem", CLEAN, gamma=1.0).groups
+    assert resolved_for(path, np.array([[1e12]])).mesh.size > path.mesh.size
+    monkeypatch.setattr("gpebo_cli.estimators._scalar.MAX_ELEMENTS", path.mesh.size - 1)
+    assert resolved_for(path, np.array([[1e12]])) is path
 
 
 def test_a_power_law_that_no_step_resolves_ends_in_one_line():
