@@ -29,6 +29,7 @@ from gpebo_cli.estimators._scalar import (
     lion_rows,
     low_pass,
     mix,
+    resolved_for,
     scalar_law,
     scalar_path,
 )
@@ -299,6 +300,16 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
     large = regression(lambda t: np.broadcast_to(1e3 * row, (*np.shape(t), 2)), ETA[:2])
     with pytest.raises(SolverError, match=r"does not settle near t = .*; lower estimator\.beta"):
         information(large, 1.0, f0, 10.0, bound)  # of 1e6 by 1e-6 rounding leaves nothing
+
+
+def test_what_of_G_is_rounding_early_in_an_element_is_no_question_of_the_unit_of_time():
+    """G is ∫ψᵀψ, in which the unit of time stands once, and in units of parameters by its root."""
+    found = []
+    for unit in 1e-6, 1.0, 1e6:
+        made = regression(lambda t, unit=unit: three(t / unit), ETA, 10.0 * unit)
+        told = information(made, 1.0, None, 0.0, None).at(np.array([1e-3, 0.01, 0.06]) * unit)
+        found.append(told.units / np.sqrt(unit))
+    np.testing.assert_allclose(found, np.broadcast_to(found[1], np.shape(found)), rtol=1e-6)
 
 
 def test_what_is_mixed_keeps_the_digits_of_small_columns():
@@ -1127,6 +1138,13 @@ def test_a_step_of_the_power_law_is_resolved_to_its_digits(delta, digits, error,
     change, nodes = np.array([0.0, error, 0.0]), np.ones((3, 5))
     found = _resolved(path, values, change, delta * nodes, digits * nodes)
     np.testing.assert_array_equal(found, [good, good, True])
+
+
+def test_elements_that_a_large_gain_asks_for_are_no_more_than_may_be(monkeypatch):
+    (path,) = estimate("drem", CLEAN, gamma=1.0).groups
+    assert resolved_for(path, np.array([[1e12]])).mesh.size > path.mesh.size
+    monkeypatch.setattr("gpebo_cli.estimators._scalar.MAX_ELEMENTS", path.mesh.size - 1)
+    assert resolved_for(path, np.array([[1e12]])) is path
 
 
 def test_a_power_law_that_no_step_resolves_ends_in_one_line():

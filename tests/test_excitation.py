@@ -54,6 +54,23 @@ def test_eigenvalues_of_the_circuit_match_the_reference():
     assert found.is_ie
 
 
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.998, 1.0])
+def test_t_c_within_an_element_is_where_a_constant_reaches_rho(share):
+    """∫1 dt = ρ at t = ρ, before the first node of an element and behind the last but one, too."""
+    made = regression(lambda t: np.ones((*np.shape(t), 1)), [1.0], 10.0)
+    rho = float(made.mesh.edges[2] + share * made.mesh.steps[2])
+    found = assess(made, np.array([0.0, 10.0]), ExcitationSettings(rho=rho))
+    assert found.t_c == pytest.approx(rho, rel=1e-12)
+
+
+@pytest.mark.parametrize("horizon", [0.5, 80.0])
+def test_a_window_is_a_tenth_of_the_horizon_or_what_is_said(horizon):
+    made = regression(lambda t: np.stack([1 + 0 * t, t], axis=-1), [1.0, 2.0], horizon)
+    t = np.array([0.0, horizon])
+    assert assess(made, t, ExcitationSettings()).window == pytest.approx(horizon / 10, rel=1e-15)
+    assert assess(made, t, ExcitationSettings(window=3.0)).window == 3.0
+
+
 def test_eigenvalues_and_window_against_quadrature():
     found = assess(CLEAN, T, ExcitationSettings(rho=0.5, window=2.5))
     for k in (40, 120, 200):

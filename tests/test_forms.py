@@ -377,6 +377,28 @@ def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
     assert list(found.derivatives) == derivatives
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_derivative_that_is_rounding_in_other_coordinates_is_none(seed):
+    """Of x1' = x3 − x1 + u, x2' = x1 − x2 and 0 = x1 − v: x3 follows v', and no constraint u'.
+
+    That holds of matrices with twelve decimals, too.
+    """
+    P, Q = np.random.default_rng(seed).normal(size=(2, 3, 3))
+    E, A, B = (matrix.round(12).tolist() for matrix in (
+        P @ np.diag([1, 1, 0]) @ Q, P @ [[-1, 0, 1], [1, -1, 0], [1, 0, 0]] @ Q,
+        P @ [[1, 0], [0, 0], [0, -1]],
+    ))
+    system = plant_from_mapping({
+        "name": "p", "states": ["a", "b", "c"], "inputs": {"u": "sin(t)", "v": "cos(t)"},
+        "outputs": ["y"], "E": E, "A": A, "B": B, "C": [[1, 0, 0]], "initial_state": [1, 1, 1],
+    })
+    t = np.linspace(0.0, 2.0, 17)
+    inputs = InputDerivatives.of_plant(system, np.array([False, True]))
+    given = EquationForm.given(system, inputs, t)
+    found = strangeness_free(given, t, t, None, max_mu=3, rank_tol=1e-10)
+    assert list(found.derivatives) == [(1, 1)]
+
+
 @pytest.mark.parametrize("known", [None, False, True])
 def test_an_input_in_the_equations_needs_its_derivatives_where_they_are_differentiated(known):
     """Tanks whose leak an input sets: the derivative of the other one is in a hidden constraint."""

@@ -412,6 +412,12 @@ def test_an_ideal_transformer():
     assert result["y_it1"][-1] == pytest.approx(0.125)  # 0.5 A through R1, divided by the ratio
 
 
+def test_a_line_between_two_transformers_is_grounded_by_these():
+    text = "t\nV1 a 0 2\nT1 a 0 b 0 n=4\nR1 b c 1\nT2 e 0 c 0 n=4\nR2 e 0 1\n"
+    result = simulated(plant_of(text, measure="v(e)"), 1.0)  # R2 is 1/16 Ω at c, beside 1 Ω
+    assert result["y_e"][-1] == pytest.approx(2.0 / 17.0)
+
+
 @pytest.mark.parametrize(("text", "measure", "value"), [
     ("V1 a 0 2\nR1 a 0 1\nH1 a 0 V1 -5", "i(V1)", -0.4),
     ("I1 0 a 1m\nG1 a b a b 1m\nG2 b 0 b 0 2m", "v(a)", 1.5),
@@ -798,7 +804,7 @@ def test_to_xarray():
     assert estimates["e0_b_hat"].attrs == {"units": "V"}  # an initial error has its state's
     plant = one_state(states=["v_true"], outputs=["v"], units={"v_true": "m", "v": "mm"})
     signals = run(plant, observer="none", time={"horizon": 1.0}).to_xarray()
-    assert [signals[name].attrs["units"] for name in ("v_true", "v")] == ["m", "mm"]
+    assert [signals[name].attrs["units"] for name in ("v_true", "v", "t")] == ["m", "mm", "s"]
 
 
 @pytest.mark.parametrize("package", ["control", "xarray"])

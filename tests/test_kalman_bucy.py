@@ -260,7 +260,8 @@ def test_a_measured_state_is_determined_whatever_is_not(process):
     assert "not determined by the data: z, e0_z;" in result.verdict
 
 
-def test_uniform_observability_is_measured_by_P0():
+@pytest.mark.parametrize("share", [1.0, 0.01])
+def test_uniform_observability_is_measured_by_P0(share):
     """Of states that stand still the Gramian is ∫CᵀV⁻¹C: one known at the start counts as others.
 
     λ_min is that of P0^½ M P0^½, and a state of variance 0 has the largest of the deviations. Here
@@ -270,10 +271,12 @@ def test_uniform_observability_is_measured_by_P0():
         {"name": "still", "states": ["a", "b", "c"], "outputs": ["y1", "y2", "y3"],
          "E": np.eye(3).tolist(), "A": np.zeros((3, 3)).tolist(),
          "C": [["exp(-t/5)", 0, 0], [0, 2, 0], [0, 0, 1]], "initial_state": [1, 2, 3]},
-        observer={"name": "kalman_bucy", "P0": {"w_a": 4.0, "w_b": 9.0, "w_c": 0.0}},
+        observer={
+            "name": "kalman_bucy", "P0": {"w_a": 4.0 * share, "w_b": 9.0 * share, "w_c": 0.0},
+        },
         noise={"name": "gaussian", "outputs": 0.02, "sample_time": 0.1}, time={"horizon": 5.0},
     )
-    found, unit = result.details.estimation.requirement, 1.0 / (0.02**2 * 0.1)
+    found, unit = result.details.estimation.requirement, share / (0.02**2 * 0.1)
     first, last = (2.5 * (np.exp(-0.4 * t) - np.exp(-0.4 * t - 0.2)) for t in (0.0, 4.5))
     longer = {"largest_lambda_min": 4.0 * unit * first, "needed": 1e-8 * 9.0 * 2.0**2 * 0.5 * unit}
     for key, value in longer.items():  # of windows that end at an edge

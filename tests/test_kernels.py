@@ -14,7 +14,7 @@ import pytest
 from kernel_paths import needs_kernels
 
 from gpebo_cli import kernels
-from gpebo_cli.kernels import structure_numpy
+from gpebo_cli.kernels import laws_numpy, structure_numpy
 from gpebo_cli.numerics.elimination import steps_of
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.radau import radau_rule
@@ -445,6 +445,15 @@ def test_a_matrix_of_zeros_among_others_has_the_determinant_zero(scale):
     assert not delta[11:22].any()
     assert delta[:11].all()
     assert delta[22:].all()
+
+
+def test_a_matrix_whose_inverse_has_no_finite_norm_is_singular_without_a_warning():
+    extended = np.array([[[1e-160, 0.0, 1.0], [0.0, 1.0, 2.0]]])
+    for twin in kernels.laws, laws_numpy:
+        delta, quotient, condition = twin.mixed(extended, None)
+        np.testing.assert_allclose(delta, [1e-160], rtol=1e-13)
+        np.testing.assert_allclose(quotient[0, :, 0], [1e160, 2.0], rtol=1e-13)
+        assert not condition[0] < 1e160
 
 
 @needs_kernels

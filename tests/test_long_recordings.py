@@ -14,7 +14,7 @@ from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.excitation import assess
 from gpebo_cli.evidence.groups import each_alone, grouped
 from gpebo_cli.experiment import fit
-from gpebo_cli.experiment.fit import _follows, _varies_slowly
+from gpebo_cli.experiment.fit import _follows, _step, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
@@ -410,6 +410,26 @@ def test_the_residual_of_two_long_files_is_that_of_their_rows(tmp_path):
     for data in files[:1], files:
         found = run(plant, data=data, estimator="least_squares", time={"samples": 5}).details.fit
         assert found.residual == pytest.approx([np.std(left[: len(data)])], rel=0.01)
+
+
+@pytest.mark.parametrize("hold", ["zoh", "linear"])
+def test_noise_of_two_files_is_white_however_many_times_are_asked_for(hold, tmp_path):
+    """Ten to a row, where what is held or interpolated between two rows is alike."""
+    t, noise, files = np.linspace(0.0, 4.0, 81), np.random.default_rng(0), []
+    for k in range(2):
+        y = 3.0 * np.exp(-t) + 0.1 * noise.standard_normal(81)
+        files.append(write_table(tmp_path / f"{k}.csv", {"t": t, "y": y}))
+    found = run(one_state(A=[[-1]]), data={"file": files, "hold": hold},
+                estimator="least_squares", time={"samples": 1601})  # fmt: skip
+    assert found.details.fit.white
+    assert found.details.fit.lag >= 2.0 * t[1]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_to_what_an_output_is_rounded_is_no_question_of_its_sign(sign):
+    y = sign * np.repeat([3.0, 3.1, 3.2, 3.1, 3.4], 5)
+    assert _step(y) == pytest.approx(0.1)
+    assert _step(y + 0.01 * np.sin(np.arange(25.0) ** 2)) == 0.0
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

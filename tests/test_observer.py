@@ -440,10 +440,11 @@ def test_what_no_output_sees_is_not_excited_by_rounding(g):
     assert unknown == {"a", "b", "e0_2"}
 
 
+@pytest.mark.parametrize("size", [1e-9, 1.0, 1e9])
 @pytest.mark.parametrize("units", [np.ones(4), 10.0 ** np.array([3, -4, 0, 5])])
-def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units):
+def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units, size):
     rng, t = np.random.default_rng(3), np.linspace(0.0, 2.0, 5)
-    E = rng.normal(size=(4, 2)) @ np.diag([1.0, 1e-7]) @ rng.normal(size=(2, 4))
+    E = rng.normal(size=(4, 2)) @ np.diag([size, 1e-7 * size]) @ rng.normal(size=(2, 4))
     moving = (1.0 + 0.5 * np.sin(t))[:, None, None] * E
     found = constant_split(moving / units, tuple("abcd"), units, 1e-10)
     assert found.rank == 2

@@ -539,6 +539,17 @@ def test_a_decimal_comma_is_the_only_sign_of_a_fraction(tmp_path):
         read(path, **how)
 
 
+@pytest.mark.parametrize(("cell", "why"), [
+    ("1e400", "too large; numbers go up to"), ("-1e60", "too large; numbers go up to"),
+    ("-inf", "not a finite number"),
+])
+def test_a_number_that_overflows_is_too_large_as_others_are(cell, why, tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(f"t,V,y\n0,1,2\n1,{cell},2\n")
+    with pytest.raises(ConfigError, match=f"line 3, column V: '{cell}' is {why}"):
+        read(path)
+
+
 def test_a_gap_is_refused_unless_it_is_said_what_to_do(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(ELSEWHERE, newline="")

@@ -413,6 +413,13 @@ def test_transport_of_an_extension(seed, p, gram):
     assert np.abs(residual).max() < 1e-12 * scale * (1 + np.abs(reset.parameters(eta)).max())
 
 
+def test_what_a_reset_mixes_with_others_does_not_go_on_as_it_is():
+    transform = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]])
+    reset = Reset(1.0, transform, np.zeros(3), 0.0)
+    assert reset.leaves(np.array([True, True, False]))
+    assert not reset.leaves(np.array([False, True, True]))
+
+
 @pytest.mark.parametrize("gram", [True, False])
 def test_knowledge_of_what_has_decayed_is_bounded(gram):
     """T shrinks one direction to nothing: it is known as well as the limit allows, no better."""

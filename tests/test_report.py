@@ -123,6 +123,8 @@ def test_every_cell_of_the_table_of_estimates():
     assert head[3] == "within ±2σ of the end since"
     known[:2] = ["e0_e1", "7", "V", "6 s", "from 2.5 s"], ["e0_e2", "8", "V", "no"]
     assert rows == known
+    eta[1, :, 2] = np.nan
+    assert cells(made)[3] == ["w_il", "not determined"]
     made = replace(made, estimation=replace(found, still=np.array([False, True])))
     assert cells(made)[1] == ["e0_e1", "not moved from 7", "V", "from 2.5 s"]
 

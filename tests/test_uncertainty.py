@@ -210,6 +210,19 @@ def assert_responses_add_up(system, estimator, t, u, y, hold, sigmas):
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=1e-5, atol=1e-7)
 
 
+def test_a_stream_of_a_law_whose_errors_nobody_knows_has_no_deviations():
+    settings = Settings(
+        estimator={"name": "power"}, noise=NoiseSettings(name="gaussian", outputs=0.1),
+        data=DataSettings("csv", "-", "linear"), time=TimeSettings(-np.inf, np.inf, 11),
+    )
+    t = np.linspace(0.0, 2.0, 11)
+    made = stream(settings, shipped("descriptor"))(0.0, np.array([0.0, 1.0])).feed(
+        t, np.sin(t)[:, None], np.cos(t)[:, None]
+    )
+    assert np.isfinite(made.states).all()
+    assert made.std is None
+
+
 TANK = one_state(
     states=["h"], inputs={"u": 0}, unknowns={"gain": 1, "leak": 1}, A=[["-1 - 0.3*u"]],
     F=[["u", -1]], initial_state=[0],

@@ -210,8 +210,6 @@ class RowReader:
                 f"{where}: {shown(cell)} is not {'a finite number' if finite else 'a number'}"
                 + ("; data.missing says what to do with a gap" if gap and not first else "")
             )
-        if not math.isfinite(value):
-            raise ConfigError(f"{where}: {shown(text)} is not a finite number")
         if abs(value) > LARGEST:
             raise ConfigError(
                 f"{where}: {shown(text)} is too large; numbers go up to {LARGEST:g} here"
