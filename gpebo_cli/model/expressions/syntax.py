@@ -163,7 +163,7 @@ def _syntax_tree(text: str) -> ast.expr:
         # Line breaks (folded YAML text) would end the expression for Python.
         return ast.parse(_GLUED.sub(r"\1 \2", " ".join(text.split())), mode="eval").body
     except (SyntaxError, ValueError) as error:
-        reason = getattr(error, "msg", None) or str(error)
+        reason = str(error)
         if "nested parentheses" in reason:
             reason = "it is nested too deeply"
         elif "integer string conversion" in reason:
