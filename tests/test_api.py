@@ -569,6 +569,17 @@ def test_memory_is_refused_by_how_many_equations_are_differential():
                 limits.check(settings, plant, levels, 1)
 
 
+def test_a_run_that_takes_too_much_memory_is_refused_before_anything_is_done(monkeypatch):
+    """Of 21 samples, with a limit of some bytes."""
+    monkeypatch.setattr("gpebo_cli.errors._MOST", 1e-8)
+    told = []
+    with refused("time.samples = 21 would take some ", "; a run may take 1e-08 GB"):
+        run_experiment(Settings(
+            {"name": "drem", "gamma": 1.0}, TimeSettings(0.0, 1.0, 21),
+        ), shipped("window"), told.append)
+    assert not told
+
+
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05}])
 @pytest.mark.parametrize(("rows", "kept"), [(303, 101), (1000, 101), (60, 20), (2, 2)])
 def test_many_cases_keep_fewer_samples_each_evenly_spread(observer, rows, kept):

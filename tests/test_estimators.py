@@ -1045,6 +1045,18 @@ def test_what_is_rounding_in_Y_is_no_estimate():
     assert not run("ls_drem", alike, f0=None).any()
 
 
+@pytest.mark.parametrize("began", [0.0, 1e8])
+@pytest.mark.parametrize("beta", [0.0, 0.1])
+def test_what_is_rounding_in_Y_does_not_hang_on_when_time_began(began, beta):
+    """A column of 1e-8 that is what terms of 1 leave: far above their rounding."""
+    made = regression(lambda t: three(t) * [1.0, 1.0, 1e-8], np.array([1.5, -0.7, 2e8]))
+    mesh = Mesh(began + made.mesh.edges, made.mesh.rule)
+    made = replace(made, Y=Trajectory(mesh, made.Y.values), psi=Trajectory(mesh, made.psi.values))
+    for name in ("least_squares", "ls_drem"):
+        (found,) = run(name, made, began + T, f0=None, beta=beta)
+        np.testing.assert_allclose(found[-1], [1.5, -0.7, 2e8], rtol=1e-5)
+
+
 @pytest.mark.parametrize("observer", [{}, {"sample_time": 0.05, "hold": "linear"}])
 def test_estimates_that_are_not_what_the_data_say_are_told(observer):
     """From 1e5, e^-6 of which is left: 1 % of the start, as was required, and far from the truth.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -332,6 +333,28 @@ def test_after_each_start_samples_are_in_groups_as_after_the_first():
     assert {25.0, 50.0, 75.0} <= set(starts.tolist())
     assert np.diff(first).max() > 10 * np.diff(first).min()
     np.testing.assert_allclose(second[: len(first)] - 50.0, first, atol=1e-9)
+
+
+def test_samples_on_both_sides_of_a_pause_begin_groups():
+    """Of them the step over it is one group's own, and none has rows before and behind it."""
+    t = np.linspace(0.0, 100.0, 20_001)
+    rows = Rows(t[(t <= 40.003) | (t >= 60.002)])
+    after = int(np.searchsorted(rows.t, 50.0))
+    assert np.flatnonzero(rows.pauses).tolist() == [after - 1]
+    starts = grouped(rows, 100.0, np.array([100.0]), np.zeros(1), 20, 16).starts
+    assert set(rows.t[after - 1 : after + 1].tolist()) <= set(starts.tolist())
+    assert len(starts) < 0.1 * len(rows.t)
+
+
+@pytest.mark.parametrize("rows", [None, Rows(TIMES), Rows(TIMES, "linear")])
+def test_what_outputs_miss_between_rows_is_that_of_the_hold(rows):
+    """A held value is off y = 3t by √(∫(3τ)²/h) = 3h/√3, and a line off y = t² by h²/4 at most."""
+    source, h = SimpleNamespace(rows=rows), TIMES[1]
+    lines = rows is not None and rows.lines
+    far = fit._missed(TIMES, np.stack([3.0 * TIMES, TIMES**2], axis=1), source)
+    assert far[0] == pytest.approx(0.0 if lines else 3.0 * h / np.sqrt(3.0), abs=1e-12)
+    if lines:
+        assert far[1] == pytest.approx(0.25 * h**2)
 
 
 TANKS = {

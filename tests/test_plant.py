@@ -398,6 +398,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "entry is hostile": (lambda: mine(E=[[1, "__import__('os')"], [0, 0]]), "E[0][1] = "),
     "no initial state": (lambda: without("initial_state"), "initial_state is missing"),
     "initial state lacks": (lambda: mine(initial_state={"x1": 1}), "initial_state lacks x2"),
+    "more than eight names": (
+        lambda: mine(states=[f"x{k}" for k in range(9)]),
+        "E has 2 rows but there are 9 states (x0, x1, x2, x3, x4, x5, x6, x7, ...)",
+    ),
     "initial state unknown": (
         lambda: mine(initial_state={"x1": 1, "x3": 0}),
         "initial_state has 'x3', which is not a state; did you mean",

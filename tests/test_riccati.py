@@ -15,7 +15,7 @@ from gpebo_cli.model.descriptor import Array
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.observers import _riccati
+from gpebo_cli.observers import _riccati, _stiff_riccati
 from gpebo_cli.observers._observability import window_gramians
 from gpebo_cli.observers._riccati import (
     Filtered,
@@ -453,9 +453,18 @@ def test_a_filter_that_forgets_fast_is_cut_for_it_at_once():
     assert sum(asked) < 15_000  # times, of all meshes that it went through
 
 
-@pytest.mark.parametrize("elements", [1, 20])
-def test_a_filter_that_is_very_fast_follows_on_few_elements(elements):
-    """P' = 2aP + q − P²/V has two roots, P₊ and P₋; (P − P₊)/(P − P₋) decays like exp(−2λt)."""
+@pytest.mark.parametrize(("elements", "longest"), [(1, np.inf), (20, np.inf), (20, 0.05)])
+def test_a_filter_that_is_very_fast_follows_on_few_elements(elements, longest, monkeypatch):
+    """P' = 2aP + q − P²/V has two roots, P₊ and P₋; (P − P₊)/(P − P₋) decays like exp(−2λt).
+
+    Elements in which Newton's method finds nothing are cut, whatever stands behind them.
+    """
+    element = _stiff_riccati._element
+    monkeypatch.setattr(_stiff_riccati, "_element", lambda rule, h, *given: (
+        element(rule, h, *given) if h <= longest else None
+    ))
+    if np.isfinite(longest):
+        monkeypatch.setattr(_stiff_riccati, "_POINTS", 30)  # two elements at once
     a, q, V = -0.3, 0.1, 1e-10
 
     def model(t, inside):

@@ -336,6 +336,13 @@ def test_a_plan_is_read_back(tmp_path):
         read_plan(tmp_path)
 
 
+def test_what_stands_in_the_place_of_a_plan_is_refused(tmp_path):
+    """A sweep would be begun over the jobs of another one."""
+    (tmp_path / "sweep.json").mkdir()
+    with pytest.raises(ConfigError, match=r"sweep\.json is not a regular file"):
+        read_plan(tmp_path)
+
+
 def test_the_table_has_a_row_for_every_job_and_case():
     records = [
         JobRecord(0, {"a": "1"}, "done", 0.5, "", [{"g": 1.0}, {"g": 2.0}]),
@@ -608,6 +615,9 @@ def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
     x = np.array([1.0, 10.0])
     figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "")
     assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
+    (image,), low, high = figure.axes[0].images, np.min(values), np.max(values)
+    middle = np.sqrt(low * high) if high == 1000 else (low + high) / 2
+    assert image.norm(middle) == pytest.approx(0.5)
 
 
 def test_error_curves_are_those_of_the_run(tmp_path):
