@@ -752,6 +752,9 @@ def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
         bounded.recursive(["a"])
     with pytest.raises(ConfigError, match=r"these can: annihilator, drem, exciting, .*, lion"):
         estimators.able(object(), estimators.Recursive, "samples")
+    several = estimators.build({"name": "instrumental", "delay": [0.2, 0.4]})
+    with pytest.raises(ConfigError, match=r"^samples; a list for estimator\.delay makes several: "):
+        estimators.able(several, estimators.Recursive, "samples")
 
 
 @pytest.mark.parametrize("name", NOT_ALONG_RESETS)

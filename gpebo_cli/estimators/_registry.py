@@ -9,15 +9,16 @@ from typing import get_type_hints
 
 import numpy as np
 
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._base import axis, combinations
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.descriptor import Array
-from gpebo_cli.registry import Registry
+from gpebo_cli.registry import Capability, Registry
 from gpebo_cli.regression.estimator import Estimates, Estimator
 from gpebo_cli.regression.linear import LinearRegression
 
 _ESTIMATORS: Registry[Estimator] = Registry("estimator")
-names, settings_of, able = _ESTIMATORS.names, _ESTIMATORS.settings_of, _ESTIMATORS.able
+names, settings_of = _ESTIMATORS.names, _ESTIMATORS.settings_of
 
 
 def build(settings: Mapping[str, object]) -> Estimator:
@@ -38,6 +39,16 @@ def build(settings: Mapping[str, object]) -> Estimator:
     built = Several(chosen, each) if any(chosen) else each[0]
     _ = built.cases  # gains are read here, so that a wrong one is found before anything is run
     return built
+
+
+def able(one: Estimator | None, capability: type[Capability], asked: str) -> Capability:
+    """:meth:`Registry.able`, and a ConfigError that says so where there are several."""
+    if isinstance(one, Several):
+        keys = ", ".join(f"estimator.{key}" for key in one.chosen[0])
+        raise ConfigError(
+            f"{asked}; a list for {keys} makes several: give one value, or sweep over it with -m"
+        )
+    return _ESTIMATORS.able(one, capability, asked)
 
 
 @dataclass(frozen=True)
