@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gpebo_cli import kernels
+from gpebo_cli.errors import ConfigError
 from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
 from gpebo_cli.numerics.linalg import (
     affine_scan,
@@ -89,12 +90,23 @@ def lion(regression: LinearRegression, rates: Array, start: Array | None = None)
     """[Ω | 𝒴] of shape (p, p + c), row i being λ_i/(p + λ_i) of one row of [ψ | Y].
 
     Of those :func:`lion_rows`: with one output every row is a filtered copy of the same ψ, and
-    rates must differ for Ω to be invertible.
+    rates must differ for Ω to be invertible (ConfigError).
     """
+    rows = lion_rows(regression)
+    refuse_equal(rows, rates)
     psi = regression.psi.values
     both = np.concatenate([psi, with_realisations(psi, regression.Y.values)], axis=-1)
-    signal = Trajectory(regression.mesh, both[:, :, lion_rows(regression)])
+    signal = Trajectory(regression.mesh, both[:, :, rows])
     return low_pass(signal, rates[:, None], start)
+
+
+def refuse_equal(rows: IntArray, rates: Array) -> None:
+    """Filters of equal ``rates`` (p,) for the same of ``rows`` (p,) make Δ zero (ConfigError)."""
+    if len({*zip(rows.tolist(), rates.tolist(), strict=True)}) < len(rates):
+        raise ConfigError(
+            "estimator.lambda: filters of the same row of ψ need rates that differ, because Δ is "
+            f"zero otherwise; got {', '.join(f'{rate:g}' for rate in rates)}"
+        )
 
 
 def lion_rows(regression: LinearRegression) -> IntArray:

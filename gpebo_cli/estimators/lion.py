@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators._mixed import FilteredEstimator
 from gpebo_cli.estimators._recursive import KreisselmeierFilter
-from gpebo_cli.estimators._scalar import lion, lion_rows
-from gpebo_cli.model.descriptor import Array, BoolArray, IntArray
+from gpebo_cli.estimators._scalar import lion, lion_rows, refuse_equal
+from gpebo_cli.model.descriptor import Array, BoolArray
 from gpebo_cli.numerics.mesh import Trajectory
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.samples import SampledRegression
@@ -21,12 +20,11 @@ from gpebo_cli.regression.samples import SampledRegression
 class Lion(FilteredEstimator):
     """Filters λ_i/(p + λ_i) of ψ and Y, mixing, and η̂_i' = γ_i Δ (𝐘_i − Δ η̂_i).
 
-    The rates must differ from one another.
+    Filters of the same row of ψ need rates that differ.
     """
 
     def extend(self, regression: LinearRegression, rates: Array, start: Array | None) -> Trajectory:
-        """Filtered rows of [ψ | Y], shape (p, p + c) (ConfigError: two of them are the same)."""
-        _differ(lion_rows(regression), rates)
+        """Filtered rows of [ψ | Y], shape (p, p + c)."""
         return lion(regression, rates, start)
 
     def seen(self, regression: LinearRegression) -> Callable[[Array, Array], Array]:
@@ -57,20 +55,11 @@ class _RowFilter(KreisselmeierFilter):
         awake[0] = self._awake
         awake = np.logical_or.accumulate(awake)  # (K + 1, rows)
         self._awake, kept = awake[-1], (awake[1:] == awake[:-1]).all(axis=1)
-        _differ(np.arange(regression.p) % awake.shape[1], self._rates[:, 0])
+        refuse_equal(np.arange(regression.p) % awake.shape[1], self._rates[:, 0])
         order = np.argsort(~awake[1:], axis=1, kind="stable")
         place = np.arange(regression.p) % np.maximum(awake[1:].sum(axis=1), 1)[:, None]
         rows = np.eye(order.shape[1])[np.take_along_axis(order, place, axis=1)]
         return kept[:, None, None] * 1.0, rows, rows
-
-
-def _differ(rows: IntArray, rates: Array) -> None:
-    """Refuse filters of equal ``rates`` (p,) for the same of the ``rows`` (p,): Δ is zero then."""
-    if len({*zip(rows.tolist(), rates.tolist(), strict=True)}) < len(rates):
-        raise ConfigError(
-            "estimator.lambda: filters of the same row of ψ need rates that differ, because Δ is "
-            f"zero otherwise; got {', '.join(f'{rate:g}' for rate in rates)}"
-        )
 
 
 ESTIMATOR = Lion

@@ -375,8 +375,7 @@ def regression_from_mapping(mapping: Mapping[str, object], source: str = "") -> 
         if not isinstance(row, Sequence) or isinstance(row, str) or len(row) != system.q:
             raise ConfigError(
                 f"{where}: psi[{i}] must be a list with an entry for each of the {system.q} "
-                f"unknowns ({', '.join(system.unknowns)}), not {shown(row)}"
-                f"{quoting(row)}"
+                f"unknowns ({', '.join(system.unknowns)}), not {shown(row)}{quoting(row)}"
             )
         psi += [read(value, f"psi[{i}][{j}]") for j, value in enumerate(row)]
     Y = None
