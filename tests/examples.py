@@ -23,7 +23,8 @@ ROOT = Path(__file__).parents[1]
 
 _SERVER = """
 import contextlib, json, os, signal, socket, sys, tempfile
-import matplotlib.backends.backend_agg, matplotlib.figure, scipy.linalg, scipy.integrate, hydra
+import matplotlib.backends.backend_agg, matplotlib.figure, scipy.linalg, scipy.integrate
+import hydra, pandas
 import gpebo_cli.api.calls, gpebo_cli.cli.job, gpebo_cli.results.gallery, gpebo_cli.estimators
 from gpebo_cli.cli.app import main
 
