@@ -39,7 +39,8 @@ def canonical(**changes):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"time": {"start": 1e9, "horizon": 1e-9}}, "too short to be resolved beside time.start"),
+        *(({"time": {"start": start, "horizon": 1e-9}}, "too short to be resolved beside time.sta")
+          for start in (1e9, -1e9)),
         ({"time": {"horizon": 1e-310}}, "1e-310 s is too short to be resolved"),
         ({"plant": plant_from_mapping(HIDDEN)}, "t = 1 puts an impulse into b; an observer cannot"),
         *(({"data": {"name": "csv", "file": file}}, "data=csv needs data.file=FILE")
