@@ -389,6 +389,23 @@ def test_window_gramians_of_a_constant_system(stages):
     np.testing.assert_allclose(gramians, np.broadcast_to(expected, gramians.shape), rtol=1e-9)
 
 
+def test_window_gramians_are_not_resolved_for_what_is_small_in_elements():
+    """The last of five states is measured, the first one acts on it by s⁴ in each short element."""
+    n, mesh = 5, initial_mesh(0.0, 20.0, [], 2000, radau_rule(6))
+    A = 10.0 * np.diag(np.ones(n - 1), -1)
+
+    def model(t: Array, inside: Array) -> tuple[Array, Array]:
+        return A[None], (1.0 + 0.5 * np.sin(t))[:, None, None] * np.diag(np.eye(n)[-1])
+
+    gramians, starts, window = window_gramians(model, n, mesh, tol=1e-9, max_elements=2100)
+    s, weights = np.polynomial.legendre.leggauss(40)
+    s = 0.5 * window * (s + 1.0)
+    row = (10.0 * s[:, None]) ** np.arange(n)[::-1] / [24, 6, 2, 1, 1]  # of e^{As}
+    W = 0.5 * window * weights * (1.0 + 0.5 * np.sin(starts[:, None] + s))
+    expected = np.einsum("ws,si,sj->wij", W, row, row)
+    np.testing.assert_allclose(gramians, expected, rtol=1e-9)
+
+
 @pytest.mark.parametrize("origin", [0.0, 1e6])
 def test_window_gramians_do_not_hang_on_the_mesh(origin):
     """A system that is seen less and less, on elements longer and shorter than windows."""
