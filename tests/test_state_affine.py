@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 from contextlib import nullcontext
@@ -26,7 +27,7 @@ from gpebo_cli.observers._base import Measurements
 from gpebo_cli.observers.reduced.system import reduced_system
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation.linearised import Linearised
-from gpebo_cli.simulation.newton import _ends, _refuse_slow, _window, follow
+from gpebo_cli.simulation.newton import _at_rest, _ends, _refuse_slow, _window, follow
 from gpebo_cli.simulation.simulate import simulate
 
 SOLVER = SolverSettings()
@@ -467,6 +468,18 @@ def test_a_rank_that_changes_where_the_solution_ends_is_its_reason(plant, at, ra
     with pytest.raises(ModelError, match=said) as caught:
         simulate(system, TimeSettings(horizon=5.0), SolverSettings(max_seconds=4.0))
     assert float(re.search(said, str(caught.value))[1]) == pytest.approx(at, abs=1e-5)
+
+
+def test_what_takes_long_is_not_refused_for_what_windows_that_are_too_long_pass(monkeypatch):
+    """Iterates of more than 0.01 s have another rank; the others stay where they are."""
+    def solve(system, time, solver, growth):
+        if time.horizon > 0.01:
+            raise ModelError("the rank changes")
+        return _at_rest(system.initial_state, time.start, time.horizon, solver)
+
+    monkeypatch.setattr("gpebo_cli.simulation.newton.process_time", itertools.count().__next__)
+    with pytest.raises(SolverError, match=r"the simulation of 20 s would take more computing time"):
+        follow(lorenz(), TimeSettings(horizon=20.0), SOLVER, solve)
 
 
 @pytest.mark.parametrize(("half", "then", "slows"), [
