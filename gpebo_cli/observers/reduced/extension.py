@@ -156,7 +156,7 @@ class _Monitor:
             raise SolverError(
                 f"the dynamic extension of plant {self._reduced.system.name} grows beyond "
                 f"{_LARGEST:.0e}: A_0 is unstable; use observer.remedy=output_injection, reset or "
-                "current_coordinates, or a shorter time.horizon"
+                "current_coordinates of observer=gpebo, or a shorter time.horizon"
             )
         reduced, rounding = self._reduced, self._reduced.first.rounding
         if rounding is not None:
