@@ -1049,3 +1049,15 @@ def test_a_rank_in_part_is_relative_to_the_size_of_the_equations(unit):
     np.testing.assert_allclose(other @ transpose(of_other) * unit, inverse @ transpose(of_plain),
                                atol=1e-9)
     np.testing.assert_allclose(also, least, rtol=1e-9)
+
+
+def test_an_unknown_input_has_no_equation_but_those_of_the_outputs():
+    """A disturbance that no output sees at once: neither form determines it, and both say why."""
+    system = plant_from_mapping({
+        "name": "p", "states": ["x", "dist"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "A": [[-1, 1], [0, 0]], "C": [[1, 0]], "initial_state": [1, 0],
+    })
+    t = np.linspace(0.0, 2.0, 5)
+    given = EquationForm.given(system, None, t)
+    with pytest.raises(ModelError, match=r"leaves out the .* outputs, which observer.form=given"):
+        strangeness_free(given, t, t, None, max_mu=3, rank_tol=1e-10)

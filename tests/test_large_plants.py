@@ -633,6 +633,23 @@ def test_initial_values_that_cannot_be_the_unknown_ones(observer, says):
         observed(observer.pop("unknown_initial"), **observer)
 
 
+def test_combinations_of_states_have_no_initial_value_to_name():
+    """Two flows whose sum is bound: errors are of combinations."""
+    bound = {
+        "name": "bound", "states": ["v", "w", "p"], "outputs": ["y"],
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "A": [[-1, 0, 1], [0, -2, 1], [1, 1, 0]],
+        "C": [[1, 0, 0]], "initial_state": [1, -1, 0],
+    }
+
+    def of(names):
+        observer = {"name": "gpebo", "form": "strangeness_free", "unknown_initial": names}
+        return run(bound, observer=observer, time={"horizon": 1.0, "samples": 5})
+
+    with pytest.raises(ConfigError, match=r"'v' has no initial error of its own: e0_1, … are of"):
+        of(["v"])
+    assert not of([]).parameters
+
+
 def test_the_extension_by_series_is_that_of_dense_elements(monkeypatch):
     found = observed(None)
     monkeypatch.setattr(extension.series, "solve_dense", lambda *_, **__: None)

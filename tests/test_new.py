@@ -169,6 +169,16 @@ def test_check_says_what_to_fix(tmp_path, right, wrong, code, expected):
     assert done.stderr.count("\n") == (code == 2)
 
 
+def test_a_refusal_that_says_what_to_do_gets_no_other_advice(tmp_path):
+    (tmp_path / "plant").mkdir()
+    text = files("plant", "tank")["plant/tank.yaml"].replace("[-k, -1]", "[-k, 3 - t]", 1)
+    (tmp_path / "plant" / "tank.yaml").write_text(text)
+    done = gpebo("check", "--config-dir", ".", "plant=tank", cwd=tmp_path)
+    assert "choose a horizon that avoids this time" in " ".join(done.stdout.split())
+    assert "to do" not in done.stdout
+    assert done.returncode == 1
+
+
 def test_every_advice_is_for_an_assumption_there_is():
     source = "".join(p.read_text() for p in (ROOT / "gpebo_cli").rglob("*.py") if p.stem != "check")
     for name in _ADVICE:

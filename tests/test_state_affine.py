@@ -398,6 +398,20 @@ def test_what_is_zero_all_along_hides_nothing(dead):
     assert found.signals.mesh.size < 30
 
 
+def test_a_plant_of_index_2_starts_from_rest():
+    """2 v' = sin t − 3 θ v of two masses on a rod, whose friction is θ times measured speeds."""
+    system = plant_from_mapping({
+        "name": "rest", "states": ["v", "w", "force"], "inputs": {"u": "sin(t)"},
+        "unknowns": {"theta": 0.5}, "outputs": ["y", "z"],
+        "E": [[1, 0, 0], [0, 1, 0], [0, 0, 0]], "A": [[0, 0, 1], [0, 0, 1], [1, 1, 0]],
+        "B": [[1], [0], [0]], "F": [["-y"], ["-2*z"], [0]], "C": [[1, 0, 0], [0, 1, 0]],
+        "initial_state": [0, 0, 0],
+    })
+    found, t = simulate(system, TimeSettings(horizon=3.0), SOLVER), np.linspace(0.0, 3.0, 31)
+    expected = 0.32 * (0.75 * np.sin(t) - np.cos(t) + np.exp(-0.75 * t))
+    np.testing.assert_allclose(found.signals.states(t)[:, 0], expected, rtol=1e-12, atol=1e-13)
+
+
 def test_an_output_that_moves_nothing_but_rounding_has_no_derivative():
     """A transistor that is off; one that conducts has its conductance."""
     plant = plant_from_mapping({

@@ -140,7 +140,9 @@ def _table(title: str, found: Sequence[Assumption], more: Sequence[str]) -> str:
             for k, v in a.evidence.items()
         )
         lines += _wrapped(evidence, " " * (width + 11))
-        if not a.holds and a.name in _ADVICE:
+        # Other refusals of a simulation say themselves what to do.
+        advised = a.name != "Solvability" or "not uniquely solvable" in evidence
+        if not a.holds and a.name in _ADVICE and advised:
             lines += _wrapped(f"to do: {_ADVICE[a.name]}", " " * (width + 11))
     failed = [a.name for a in found if not a.holds]
     verdict = f"{', '.join(failed)} failed" if failed else "everything that is needed holds"

@@ -273,11 +273,10 @@ def strangeness_free(
         structure = analyse(known, float(t[0]), float(t[-1]), max_mu=max_mu, rank_tol=rank_tol)
     except ModelError as error:
         follows = [name for name in system.outputs if name in system.followed]
-        if not follows:
-            raise
+        known_too = f"takes {listed(follows)} as known, and " if follows else ""
         raise ModelError(
-            f"{error} (observer.form=strangeness_free takes {listed(follows)} as known, and leaves "
-            "out the equations of the outputs, which observer.form=given takes, too)"
+            f"{error} (observer.form=strangeness_free {known_too}leaves out the equations of the "
+            "outputs, which observer.form=given takes, too)"
         ) from None
     whole = replace(given, structure=structure, derivatives=tuple(
         (k, j) for k in range(1, structure.mu + 1) for j in range(system.m)

@@ -265,7 +265,9 @@ def _differs(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float, a: in
 
 def unclear_ranks(system: DescriptorSystem, t: Array, unclear: UnclearError) -> ModelError:
     """What :mod:`.stages` could not tell at one of the times t (N,)."""
-    when = t[unclear.place]
+    before, when = t[max(unclear.place - 1, 0)], t[unclear.place]
+    if before < when:
+        when = [when, *system.coefficients.breakpoints(before, when)][-1]
     why = f"a rank changes near t = {when:.9g}; choose a horizon that avoids this time"
     if unclear.rounding:
         why = (

@@ -31,7 +31,7 @@ from gpebo_cli.reduction.strangeness_free import forcing
 # and by rounding over it. Without derivatives that costs Newton's method nothing that could be
 # seen.
 _SHIFT = 6e-6
-_NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this
+_NOT_ZERO = 1e-3  # of an output's largest value: below it the share is one of this, or of 1e-200
 _SAME = 1e-2  # of the longer element beside it: an edge so near to another one is that one
 _SHORT = 1e-4  # of the longer element beside it: derivatives on a shorter one are rounding
 # Of the states, and of the longer element beside it: a shorter one may have ended at a jump of an
@@ -174,7 +174,7 @@ class Linearised:
         y = along[0, :, self.system.m :].copy()
         there = t if inside is None else aside(t, inside)
         size = np.abs(y)
-        shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-300))
+        shift = _SHIFT * np.maximum(size, np.maximum(_NOT_ZERO * size.max(axis=0), 1e-200))
 
         def right_side() -> tuple[Array, Array]:
             """A x̄ + B u + F θ̄ + φ (order + 1, N, n), and which side of a jump y is on (N, ·)."""

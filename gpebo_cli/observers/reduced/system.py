@@ -341,6 +341,12 @@ def with_unknown(
     names = [name.removeprefix("e0_") for name in begin.names]
     for name in unknown:
         if name not in names:
+            if name in system.states and not set(names) <= set(system.states):
+                raise ConfigError(
+                    f"observer.unknown_initial: {shown(name)} has no initial error of its own: "
+                    f"{', '.join(begin.names[:2])}, … are of combinations of states; leave "
+                    "unknown_initial away, or name none ([])"
+                )
             raise ConfigError(
                 f"observer.unknown_initial: {shown(name)} is no differential state"
                 f"{nearest(name, names)} (differential states: {', '.join(names[:8])}"
