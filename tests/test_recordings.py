@@ -343,6 +343,7 @@ BAD = {
     "a short row": ("t,V,y\n0,1,2\n1,2\n", ["line 3", "2 cells", "header has 3"]),
     "a long row": ("t,V,y\n0,1,2,3\n", ["line 2", "4 cells", "header has 3"]),
     "an empty line": ("t,V,y\n0,1,2\n\n1,1,3\n", ["line 3", "is empty"]),
+    "two empty lines": ("t,V,y\n0,1,2\n\n\n1,1,3\n", ["line 3", "is empty"]),
     "semicolons": ("t;V;y\n0;1;2\n", ["line 1", "semicolons", "commas"]),
     "tabs": ("t\tV\ty\n0\t1\t2\n", ["line 1", "tabs"]),
     "nothing": ("", ["empty"]),
