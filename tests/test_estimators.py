@@ -319,7 +319,7 @@ def test_an_error_of_what_is_measured_is_forgotten_as_data_are():
     (at,) = estimators.build({"name": "least_squares", **gains}).errors(one)
     t = np.array([1.0, 4.0])
     found = at(t, t)
-    assert (found.A == -beta).all()
+    assert (-beta == found.A).all()
     z = np.exp(-beta * t)
     expected = alpha / (z * f0 + alpha * (1.0 - z) / beta)
     np.testing.assert_allclose(found.C[:, 0, 0], expected, rtol=1e-9)

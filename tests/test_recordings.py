@@ -365,6 +365,13 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
         assert streamed(path, text.encode())[1] == str(error.value)
 
 
+def test_a_space_separates_nothing_in_a_file_with_tabs(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_text(GOOD.replace(",", "\t").replace("1\t2\t3", "1 2\t3"))
+    with refused("line 4", "2 cells", "header has 3"):
+        read(path, separator="tab")
+
+
 @pytest.mark.parametrize("size", [1, 7, 1000])
 def test_rows_are_the_same_however_a_stream_is_cut(size):
     reader = LineReader("standard input", DataSettings("csv"), shipped("circuit"))
