@@ -825,6 +825,14 @@ def test_cases_are_the_product_of_the_lists():
     assert together.delta(T).shape == (6, len(T))
 
 
+def test_a_number_that_yaml_leaves_a_text_is_one_gain_and_no_list():
+    """1e-1 is one; a list of them makes several estimators, which samples do not take."""
+    text, plain = (
+        estimators.build({"name": "instrumental", "delay": value}) for value in ("1e-1", 0.1)
+    )
+    assert text == plain
+
+
 def test_many_gains_are_the_same_as_one_at_a_time():
     """Above the limit of the prefix scan another path is taken; the numbers stay."""
     gains = np.logspace(2, 12, 1000)
