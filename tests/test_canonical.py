@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plants import experiment, observed, reference, shipped
+from plants import experiment, observed, one_state, reference, shipped
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from units import Units, in_units
@@ -13,7 +13,11 @@ import gpebo_cli
 from gpebo_cli.configs import files
 from gpebo_cli.errors import ConfigError, ModelError
 from gpebo_cli.model.plant import plant_from_mapping
-from gpebo_cli.observers.canonical import canonical_blocks, unknown_input_matrices
+from gpebo_cli.observers.canonical import (
+    canonical_blocks,
+    remark_4_gain,
+    unknown_input_matrices,
+)
 from gpebo_cli.settings import SolverSettings
 
 SOLVER = SolverSettings()
@@ -201,6 +205,13 @@ def test_remark_4_gain_for_constant_coefficients(N32):
     assert np.abs(error).max() < 1e-3
 
 
+def test_remark_4_gain_is_that_of_the_paper():
+    """a1 c1 (c1/c2, 1) with a1 = 1/N21."""
+    N = np.zeros((1, 3, 3))
+    N[0, 1, 0] = 5.0
+    np.testing.assert_allclose(remark_4_gain(np.array([[3.0, 2.0]]), N), [[0.9, 0.6]], rtol=1e-15)
+
+
 @pytest.mark.parametrize("first", [1e-6, 1e6])
 @pytest.mark.parametrize("second", [1e-5, 1.0, 1e5])
 def test_units_of_zb_decide_no_assumption(first, second):
@@ -305,6 +316,14 @@ def test_a_plant_that_is_not_canonical_is_refused_by_entry():
     said = r"A\[2\]\[4\] is 0\.7 at t = 3 instead of 0 \(E .* diag\(A_a, I\), here n_a = 2\)"
     with pytest.raises(ModelError, match=said):
         canonical_blocks(shipped("canonical", A=rows), t, t)
+
+
+def test_a_plant_without_zb_is_canonical():
+    """ż = −0.5 z + u, y = z."""
+    system = plant_from_mapping(one_state(A=[[-0.5]]))
+    assert canonical_blocks(system, np.zeros(1), np.zeros(1)).n_a == 1
+    states = run(system).estimation.states[0, -1]
+    assert states == pytest.approx(run(system).simulation.states[-1], abs=1e-8)
 
 
 def test_a_recording_is_explained_by_the_evidence_alone():

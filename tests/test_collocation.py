@@ -431,13 +431,14 @@ def test_what_an_input_stands_beside_is_the_least_share_of_its_equations():
     np.testing.assert_allclose(found, [1.5, 10.0, 0.0])
 
 
+@pytest.mark.parametrize("begin", [0.0, 1e6])
 @pytest.mark.parametrize(("tail", "tol", "most", "sizes"), [
     (lambda h: h**4, 1e-4, 999, [2, 16, 32]),  # cuts help: until it is resolved,
     (lambda h: 1e-3 + 0 * h, 1e-4, 99_999, [2, 6, 18, 54]),  # or some have not helped,
     (lambda h: 1e-7 + 0 * h, 1e-9, 999, [2, 8]),  # or one where it may be rounding,
     (lambda h: 1e-3 + 0 * h, 1e-4, 20, [2, 6, 18]),  # or there would be too many
 ])
-def test_known_functions_are_cut_as_long_as_that_helps(tail, tol, most, sizes):
+def test_known_functions_are_cut_as_long_as_that_helps(tail, tol, most, sizes, begin):
     """What is found on the last mesh comes with it."""
     found = []
 
@@ -445,7 +446,7 @@ def test_known_functions_are_cut_as_long_as_that_helps(tail, tol, most, sizes):
         found.append(mesh.size)
         return mesh.size
 
-    start = Mesh(np.array([0.0, 1.0, 2.0]), radau_rule(4))
+    start = Mesh(np.array([0.0, 1.0, 2.0]) + begin, radau_rule(4))
     mesh, known = cut_where(lambda mesh, _: tail(mesh.steps), evaluated, start, 2, tol, most)
     assert [2, *found] == sizes
     assert known == mesh.size == sizes[-1]

@@ -302,6 +302,29 @@ def test_a_bound_is_reached_and_forgetting_that_is_too_fast_for_it_is_refused():
         information(large, 1.0, f0, 10.0, bound)  # of 1e6 by 1e-6 rounding leaves nothing
 
 
+def test_what_follows_knows_when_data_were_first_gathered():
+    early = Mesh(np.linspace(-5.0, 0.0, 6), CLEAN.mesh.rule)
+    first = information(replace(
+        CLEAN, Y=Trajectory(early, CLEAN.Y.values[:5]), psi=Trajectory(early, CLEAN.psi.values[:5])
+    ), 1.0, None, 0.0, None)
+    second = information(CLEAN, 1.0, None, 0.0, None, first.reached)
+    assert first.reached.began == second.began == second.reached.began == -5.0
+
+
+def test_an_error_of_what_is_measured_is_forgotten_as_data_are():
+    """δh' = −β δh + δY and δη̂ = αF δh, where ψ = 1 makes G_z = (1 − e^−βt)/β."""
+    beta, f0, alpha = 0.3, 0.5, 2.0
+    one = regression(lambda t: np.ones((*t.shape, 1)), [1.0], 10.0)
+    gains = {"alpha": alpha, "beta": beta, "f0": f0}
+    (at,) = estimators.build({"name": "least_squares", **gains}).errors(one)
+    t = np.array([1.0, 4.0])
+    found = at(t, t)
+    assert (-beta == found.A).all()
+    z = np.exp(-beta * t)
+    expected = alpha / (z * f0 + alpha * (1.0 - z) / beta)
+    np.testing.assert_allclose(found.C[:, 0, 0], expected, rtol=1e-9)
+
+
 def test_what_of_G_is_rounding_early_in_an_element_is_no_question_of_the_unit_of_time():
     """G is ∫ψᵀψ, in which the unit of time stands once, and in units of parameters by its root."""
     found = []
@@ -800,6 +823,14 @@ def test_cases_are_the_product_of_the_lists():
         np.testing.assert_allclose(all_cases[i], alone, atol=1e-9)
     np.testing.assert_allclose(together.parameters(slice(2, 5)), all_cases[2:5], atol=1e-9)
     assert together.delta(T).shape == (6, len(T))
+
+
+def test_a_number_that_yaml_leaves_a_text_is_one_gain_and_no_list():
+    """1e-1 is one; a list of them makes several estimators, which samples do not take."""
+    text, plain = (
+        estimators.build({"name": "instrumental", "delay": value}) for value in ("1e-1", 0.1)
+    )
+    assert text == plain
 
 
 def test_many_gains_are_the_same_as_one_at_a_time():
@@ -1306,6 +1337,14 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
     share = np.where(known, 2.0 / (2.0 * sizes + 0.5 * own), 0.0)
     expected = (vectors * share[:, None]) @ vectors.T
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
+    H = 2.0 * sizes / (2.0 * sizes + 0.5 * own)  # eigenvalues of H, and of adj(H) αF by minors
+    others = np.stack([H[:, [1, 2]], H[:, [0, 2]], H[:, [0, 1]]], axis=1).prod(axis=2)
+    delta, mixed, _ = info.mixing(2.0, 0.5, np.ones(4, dtype=bool))
+    np.testing.assert_allclose(delta, H.prod(axis=1), rtol=1e-9, atol=1e-8)
+    weights = others * 2.0 / (2.0 * sizes + 0.5 * own)
+    np.testing.assert_allclose(
+        mixed, (vectors * weights[:, None]) @ vectors.T, rtol=1e-8, atol=1e-8 * weights.max()
+    )
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
     if units is None:  # ‖F‖ of F = (f₀ I + α G)⁻¹ in beside a bound of 4

@@ -144,12 +144,13 @@ def test_t_c_is_no_rounding_of_what_g_grows_to(bend, horizon):
         lambda x: 1.0 - (1 / 3 + x / 4) / np.sqrt((1 / 3 + x / 2 + x**2 / 5) / 3) - 1e-4, 0.01, 1.0
     )
     assert found.t_c == pytest.approx(x / bend, rel=1e-6)
-    mesh = Mesh(bent.mesh.edges - 1e6, bent.mesh.rule)  # which is not known to 1e-14 of a horizon
-    early = replace(
-        bent, Y=Trajectory(mesh, bent.Y.values), psi=Trajectory(mesh, bent.psi.values)
-    )
-    seen = assess(early, np.linspace(-1e6, horizon - 1e6, 101), ExcitationSettings())
-    assert seen.t_c == pytest.approx(found.t_c - 1e6, abs=1e-7)
+    for begin in (-1e6, 1e10):  # which is not known to 1e-14 of a horizon
+        mesh = Mesh(bent.mesh.edges + begin, bent.mesh.rule)
+        moved = replace(
+            bent, Y=Trajectory(mesh, bent.Y.values), psi=Trajectory(mesh, bent.psi.values)
+        )
+        seen = assess(moved, np.linspace(begin, horizon + begin, 101), ExcitationSettings())
+        assert seen.t_c == pytest.approx(found.t_c + begin, abs=1e-13 * abs(begin), rel=0.0)
     first = assess(bent, 1e-5 * np.arange(3.0), ExcitationSettings()).known
     assert (first.margin[1:] < 1.0).all()  # one cannot know there, and it is said
 

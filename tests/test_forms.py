@@ -377,14 +377,15 @@ def test_which_derivatives_hidden_constraints_contain_is_no_question_of_units(
     assert list(found.derivatives) == derivatives
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e9])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_derivative_that_is_rounding_in_other_coordinates_is_none(seed):
+def test_a_derivative_that_is_rounding_in_other_coordinates_is_none(seed, unit):
     """Of x1' = x3 − x1 + u, x2' = x1 − x2 and 0 = x1 − v: x3 follows v', and no constraint u'.
 
     That holds of matrices with twelve decimals, too.
     """
     P, Q = np.random.default_rng(seed).normal(size=(2, 3, 3))
-    E, A, B = (matrix.round(12).tolist() for matrix in (
+    E, A, B = ((unit * matrix.round(12)).tolist() for matrix in (
         P @ np.diag([1, 1, 0]) @ Q, P @ [[-1, 0, 1], [1, -1, 0], [1, 0, 0]] @ Q,
         P @ [[1, 0], [0, 0], [0, -1]],
     ))

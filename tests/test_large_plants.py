@@ -1022,6 +1022,21 @@ def test_series_that_end_where_a_component_is_lost_lose_it_there():
     assert lost(first - 0.1) is None
 
 
+def test_a_component_that_is_nothing_is_measured_by_the_largest_that_it_was_ever_made_of():
+    """a' = −a + u and b' = −b + u of u = 0 up to t = 1 and 1 then; c' = a − b is rounding."""
+    A = np.kron(np.eye(3), [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [3.0, -3.0, 0.0]])[None]
+    driven, one = np.tile([[1.0], [1.0], [0.0]], (3, 1)), np.ones((9, 1))
+    problem = LinearProblem(
+        lambda t, inside: LinearEquation(None, A, (inside > 1.0)[:, None, None] * driven),
+        0.0 * one, name="alike", units=one,
+    )
+    mesh = initial_mesh(0.0, 2.0, [1.0], 20, radau_rule(10))
+    found = series.solve_dense(problem, mesh, tol=1e-8, max_elements=20)
+    c = np.abs(found.trajectory.values[:, :, 2]).max()
+    assert c < 1e-15
+    assert (found.errors[2::3] < 1e-8).all()
+
+
 def test_errors_of_series_see_noise_that_no_mesh_resolves():
     """x' = cos t + 1e-6 sin 1e9t: coefficients of the polynomials do not fall."""
     def coefficients(t, inside):

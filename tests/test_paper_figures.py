@@ -355,6 +355,8 @@ def test_a_difference_says_which_curve_where_and_by_how_much(tmp_path: Path) -> 
     moved = np.maximum(t, 0.01)  # where the reference is zero
     one, other = ([Panel("y", (Curve(t, y, "", line(0)),))] for y in (moved, t))
     assert len(compare(one, other, tmp_path)) == 1
+    one, other = ([Panel("y", (Curve(t, y, "", line(0)),))] for y in (-1.1 * t, -t))
+    assert len(compare(one, other, tmp_path)) == 1
 
 
 def test_rounding_is_no_difference(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from processes import refused
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
-from gpebo_cli.reading import as_seen_from_here, read_bytes
+from gpebo_cli.reading import as_seen_from_here, beside, read_bytes
 from gpebo_cli.schema import LARGEST, nearest, number, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
@@ -128,3 +128,10 @@ def test_whatever_is_contentthe_answer_is_settings_or_one_config_error(mapping):
         return
     assert type(built.tol) is float
     assert type(built.stages) is int
+
+
+def test_a_plant_from_python_may_name_any_file_and_one_of_a_configuration_may_not(tmp_path):
+    source = str(tmp_path / "plant" / "mine.yaml")
+    assert beside(os.devnull, "", "inputs.u") == os.devnull
+    with pytest.raises(ConfigError, match=rf"inputs\.u: {os.devnull} lies outside of "):
+        beside(os.devnull, source, "inputs.u")

@@ -343,6 +343,7 @@ BAD = {
     "a short row": ("t,V,y\n0,1,2\n1,2\n", ["line 3", "2 cells", "header has 3"]),
     "a long row": ("t,V,y\n0,1,2,3\n", ["line 2", "4 cells", "header has 3"]),
     "an empty line": ("t,V,y\n0,1,2\n\n1,1,3\n", ["line 3", "is empty"]),
+    "two empty lines": ("t,V,y\n0,1,2\n\n\n1,1,3\n", ["line 3", "is empty"]),
     "semicolons": ("t;V;y\n0;1;2\n", ["line 1", "semicolons", "commas"]),
     "tabs": ("t\tV\ty\n0\t1\t2\n", ["line 1", "tabs"]),
     "nothing": ("", ["empty"]),
@@ -362,6 +363,13 @@ def test_a_mistake_in_a_file_is_named_with_its_place(tmp_path, mistake):
     assert ("with a gap" in str(error.value)) == (mistake == "nan")
     if parts[0].startswith("line"):  # a stream, whose length nobody knows, says the same
         assert streamed(path, text.encode())[1] == str(error.value)
+
+
+def test_a_space_separates_nothing_in_a_file_with_tabs(tmp_path):
+    path = tmp_path / "bad.csv"
+    path.write_text(GOOD.replace(",", "\t").replace("1\t2\t3", "1 2\t3"))
+    with refused("line 4", "2 cells", "header has 3"):
+        read(path, separator="tab")
 
 
 @pytest.mark.parametrize("size", [1, 7, 1000])

@@ -287,9 +287,16 @@ def test_a_kernel_that_rotates_leaves_the_papers_regression_its_outputs(remedy):
     assert result.regression.psi.shape[1] == rows
 
 
-def test_that_a_kernel_has_no_part_in_w_weighs_as_much_as_outputs_do():
-    """Rows c Q w = 0 of a projector Q in comparable units; c is as large as ψ is at first."""
+@pytest.mark.parametrize("sign", [1, -1])
+def test_that_a_kernel_has_no_part_in_w_weighs_as_much_as_outputs_do(sign):
+    """Rows c Q w = 0 of a projector Q in comparable units; c is as large as ψ is at first.
+
+    Whatever the signs of constraints and outputs are.
+    """
     plant = {**ROTATING, "initial_state": dict.fromkeys(ROTATING["states"], 0.0)}
+    *moving, first, second, output = *plant["A"], *plant["C"]
+    first, second, output = ([f"{sign}*({x})" for x in row] for row in (first, second, output))
+    plant |= {"A": [*moving, first, second], "B": [[0], [0], [-sign], [0]], "C": [output]}
     given = Units(10.0 ** np.array([3, 0, -4, 1]), *map(np.ones, (1, 1, 1, 4)), 1.0)
     _, observation = along(
         plant_from_mapping(in_units(plant, given)), 5.0, remedy="current_coordinates"

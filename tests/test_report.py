@@ -390,6 +390,14 @@ def test_figures_of_plants_in_subfolders_are_files_of_their_own(inside):
     ]
 
 
+def test_what_is_no_run_in_a_folder_of_runs_is_passed_over(tmp_path):
+    for name in ("b", "a", "empty"):
+        (tmp_path / name).mkdir()
+    for file in ("b/summary.json", "a/summary.json", "notes.txt"):
+        (tmp_path / file).write_text("{}")
+    assert [Path(found.path).name for found in find(str(tmp_path))] == ["a", "b"]
+
+
 @pytest.mark.parametrize(("values", "drawn"), [
     ([1.0, 2.0, 3.0], ["over_x"]), ([0.0, 1.0, 2.0], []), ([1.0, 2.0, 3.0, math.inf], []),
     (["a", "b", "c"], []),

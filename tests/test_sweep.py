@@ -545,6 +545,9 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
     assert [(curve.label, curve.y.tolist()) for curve in first.curves] == [("quiet", [1e-9] * 3)]
     assert first.curves[0].x.tolist() == [1.0, 10.0, 100.0]
+    again = replace(quiet[0], run="again/1", chosen={"gamma": 10.0, "plant": "p"})
+    (first, *_) = metric_panels([*quiet, again], "gamma")
+    assert [curve.label for curve in first.curves] == ["quiet"]  # one run's own curve
     two = [replace(c, chosen=c.chosen | {"estimator": name})
            for name in ("drem", "mre") for c in quiet]
     panels = metric_panels(two, "gamma")
@@ -604,6 +607,7 @@ def test_a_map_has_each_case_in_its_place():
 
 
 @pytest.mark.parametrize(("values", "told"), [
+    ([[3, 4], [5, 12]], ["3", "6", "9", "12"]),
     ([[1, 2], [3, 1000]], ["1", "10", "1e+02", "1e+03"]),
     ([[0, 2], [3, 90]], ["0", "30", "60", "90"]), ([[1, 2], [3, 4]], ["1", "2", "3", "4"]),
 ])

@@ -101,7 +101,7 @@ def sampled_mesh(mesh: Mesh, sample_time: float, parts: int = 1) -> SampledMesh:
     ``parts``: into how many elements an interval between instants is cut.
     """
     start, stop = mesh.edges[0], mesh.edges[-1]
-    count = max(1, ceil((stop - start) / sample_time - _SAME))
+    count = ceil((stop - start) / sample_time - _SAME)
     wanted = start + np.arange(count * parts) * (sample_time / parts)
     wanted = wanted[wanted < stop - _SAME * sample_time]
     # Where both kinds of edges (nearly) meet, the mesh's own stays: a jump stands there.

@@ -180,8 +180,7 @@ def _tail_of_numbers(
             made_of = values[part].reshape(count * values.shape[1], *values.shape[2:])
         tail[part] = unresolved_signals(
             problem, mesh.rule, values[part],
-            tuple(e if e.shape[:2] == (1, 1) else e[part] for e in maps[3:]),
-            largest_over_time(made_of), tol,
+            tuple(e[part] for e in maps[3:]), largest_over_time(made_of), tol,
         )
     return tail
 

@@ -75,7 +75,7 @@ def canonical_blocks(system: DescriptorSystem, t: Array, inside: Array) -> Block
     n, ones = system.n, np.abs(np.diag(E[0]) - 1.0) <= _ZERO
     n_a = n if ones.all() else int(np.argmin(ones))  # leading ones on the diagonal of E
     one, n_b = np.eye(n), n - n_a
-    expected_E, expected_A = np.diag(one[:n_a].sum(axis=0)), np.diag(one[n_a:].sum(axis=0))
+    expected_E, expected_A = np.diag(one[:n_a].sum(axis=0)), one
     free_E, free_A = np.zeros((n, n), bool), np.zeros((n, n), bool)
     free_E[n_a:, n_a:], free_A[:n_a, :n_a] = np.tri(n_b, k=-1, dtype=bool), True
     known = ("E", E, expected_E, free_E), ("A", A, expected_A, free_A)
