@@ -344,6 +344,18 @@ def test_what_is_mixed_keeps_the_digits_of_small_columns():
     np.testing.assert_allclose(Y / delta[:, None], [ETA / units] * 2, rtol=1e-12)
 
 
+def test_behind_an_f0_a_large_column_hides_nothing_of_the_others():
+    """F and Δ = det(I − z f₀F) are those that units give in which columns are of one size."""
+    units, t, f0 = np.array([1.0, 1e9, 1.0]), np.array([5.0, 9.0]), 1e-3
+    known = information(regression(lambda t: three(t) * units, ETA / units), 1.0, f0, 0.0, None)
+    gram = regression(three, ETA).gram(t)[..., :3]
+    F = np.linalg.inv(gram + f0 * np.diag(units**-2.0))
+    found = known.at(t, t).covariance(1.0, f0) * units * units[:, None]
+    np.testing.assert_allclose(found, F, rtol=1e-9)
+    delta, _, _ = mix_least_squares(known, 1.0, f0, t).signals(t, t)
+    np.testing.assert_allclose(delta, np.linalg.det(F @ gram), rtol=1e-9)
+
+
 @pytest.mark.parametrize("name", ["least_squares", "ls_drem", "fct"])
 def test_what_is_not_excited_stays_where_it_was_however_fast_it_is_forgotten(name):
     blind = regression(lambda t: np.zeros((*np.shape(t), 3)), ETA, elements=4)

@@ -190,6 +190,12 @@ def test_equal_weights_change_nothing_and_an_output_that_has_none_weighs_1():
         assert plain.psi.values.tobytes() == equal.psi.values.tobytes()
 
 
+def test_weights_count_outputs_as_they_are_written():
+    """No unit is in between; without that 1/σ² would not be the best."""
+    psi = observed(two_outputs(C=[[1], [50]]), 2.0, weights=[9.0, 1.0])[1].regression.psi.values
+    assert psi[..., 1, :] == pytest.approx(50.0 / 3.0 * psi[..., 0, :])
+
+
 def test_weighted_elimination_is_weighted_least_squares():
     """K minimises ‖W^½(𝒜v + g)‖, and the squares of ψ are those of what is left, weighted."""
     system = shipped(

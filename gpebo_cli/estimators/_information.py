@@ -133,7 +133,7 @@ class InformationAt:
     @cached_property
     def smallest(self) -> float:
         """The smallest eigenvalue of G_z at the last time."""
-        last = self._some(slice(-1, None))
+        last = self.some(slice(-1, None))
         return max(float(np.linalg.eigvalsh(last.gram)[0, 0]), 0.0)
 
     def solution(self, alpha: float, f0: float, start: Array) -> Array:
@@ -167,7 +167,7 @@ class InformationAt:
         if self.units is not None:
             adjugate /= self.units[..., None] * self.units[:, None]
         if rest.any():
-            s = self._some(rest).spectrum
+            s = self.some(rest).spectrum
             delta[rest] = s.delta(alpha, f0)
             weighted = s.vectors * s.adjugate(alpha, f0)[:, None]
             adjugate[rest] = weighted @ transpose(s.vectors)
@@ -185,10 +185,11 @@ class InformationAt:
             found /= self.units[..., None] * self.units[:, None]
         found *= alpha
         if rest.any():
-            found[rest] = self._some(rest).spectrum.covariance(alpha, f0)
+            found[rest] = self.some(rest).spectrum.covariance(alpha, f0)
         return found
 
-    def _some(self, chosen: BoolArray | slice) -> InformationAt:
+    def some(self, chosen: BoolArray | slice) -> InformationAt:
+        """The same at some of the times."""
         units = None if self.units is None else self.units[chosen]
         return InformationAt(self.values[chosen], self.memory[chosen], units)
 

@@ -13,7 +13,13 @@ from functools import partial
 import numpy as np
 
 from gpebo_cli.estimators._base import ResumableEstimator, gain
-from gpebo_cli.estimators._information import Information, InformationAt, Spectrum, check_held
+from gpebo_cli.estimators._information import (
+    CLEAR,
+    Information,
+    InformationAt,
+    Spectrum,
+    check_held,
+)
 from gpebo_cli.estimators._mixed import (
     MixedEstimates,
     RecursiveMixed,
@@ -192,10 +198,13 @@ def _mixed_at(
 ) -> tuple[Array, Array, Array, Spectrum]:
     """Δ (M,), 𝐘/Δ = G_z⁻¹ h_z (M, p, c), its digits (M,), and the spectrum that H is of.
 
-    The quotient is solved in parameters' own units: others may hide most digits.
+    The quotient is solved in parameters' own units: others may hide most digits, and those of Δ.
     """
-    quotient, digits = at.in_own_units.quotient()
-    return at.spectrum.delta(alpha, f0), quotient, digits, at.spectrum
+    (quotient, digits), s = at.in_own_units.quotient(), at.spectrum
+    delta, few = s.delta(alpha, f0), s.digits < CLEAR
+    if at.units is None and few.any():
+        delta[few] = at.some(few).mixing(alpha, f0, few[few])[0]
+    return delta, quotient, digits, s
 
 
 ESTIMATOR = LsDrem

@@ -127,13 +127,17 @@ def determinant_and_inverse(omega: Array) -> tuple[Array, Array, BoolArray]:
     """det(Ω) (N,) and Ω⁻¹ of Ω (N, p, p) by elimination, and where it leaves too few digits (N,).
 
     There Ω⁻¹ is zero. It is for deviations, of which three digits do, and saves most of the time
-    that singular values take.
+    that singular values take. Digits are those in units in which the diagonal is 1.
     """
-    extended = np.concatenate([omega, np.broadcast_to(np.eye(omega.shape[1]), omega.shape)], axis=2)
+    size = np.sqrt(np.abs(np.einsum("nii->ni", omega)))[..., None]
+    size[size == 0.0] = 1.0
+    both = size * transpose(size)
+    one = np.broadcast_to(np.eye(omega.shape[1]), omega.shape)
+    extended = np.concatenate([omega / both, one], axis=2)
     determinant, inverse, condition = laws.mixed(extended, None)
     unclear = ~(condition < _CLEAR)
     inverse[unclear] = 0.0
-    return determinant, inverse, unclear
+    return determinant * np.prod(size[..., 0] ** 2, axis=1), inverse / both, unclear
 
 
 _SCAN_LIMIT = 1 << 11  # above this many parallel recurrences a plain loop over k moves less memory

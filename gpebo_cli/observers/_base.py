@@ -437,14 +437,14 @@ def initial_extension(
     return per_name(given, labels, "differential state", where, "finite", absent=0.0)
 
 
-def output_scale(weights: ByName | None, system: DescriptorSystem) -> Array:
-    """√(w/max w) of the weights w, shape (r,): exactly one for outputs that count equally.
+def output_scale(weights: ByName | None, system: DescriptorSystem) -> Array | None:
+    """√(w/max w) of the weights w, shape (r,); without weights None, each output in its own unit.
 
     Raises:
         ConfigError: the wrong number of weights, an unknown output, or no positive one.
     """
     if weights is None:
-        return np.ones(system.r)
+        return None
     w = per_name(weights, system.outputs, "output", "observer.weights", absent=1.0)
     if not w.any():
         raise ConfigError("observer.weights: at least one output must have a positive weight")

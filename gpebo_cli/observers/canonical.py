@@ -123,7 +123,8 @@ class Canonical:
         mesh = signals.mesh
         blocks = canonical_blocks(system, mesh.points.ravel(), mesh.inside.ravel())
         n_a, suitable = blocks.n_a, _outputs_without_zb(system, blocks)
-        scale = output_scale(self.weights, system)[suitable]
+        scale = output_scale(self.weights, system)
+        scale = None if scale is None else scale[suitable]
         of_za = replace(
             system, states=system.states[:n_a], initial_state=system.initial_state[:n_a],
             outputs=tuple(system.outputs[k] for k in suitable),
@@ -134,11 +135,11 @@ class Canonical:
         own = Trajectory(mesh, signals.outputs.values[:, :, suitable])
         found = Plain().observe(reduced_system(
             of_za, replace(signals, outputs=own, asked=None), solver, form="given",
-            xi_a0=self.xi_a0, weights=(scale**2).tolist(),
+            xi_a0=self.xi_a0, weights=None if scale is None else (scale**2).tolist(),
         ))
         # The general observer has 0 = C ξ_a − y + …, and the paper's y = …: signs are the paper's.
         # Weights are relative to those of all outputs, not of these alone.
-        regression, size = found.regression, scale.max()
+        regression, size = found.regression, 1.0 if scale is None else scale.max()
         Y, psi = (Trajectory(x.mesh, -size * x.values) for x in (regression.Y, regression.psi))
         zb = _unknown_input_observer(self, system, regression.mesh, signals, n_a)
 

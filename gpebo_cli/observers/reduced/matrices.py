@@ -67,7 +67,7 @@ class ObserverMatrices:
     """
 
     split: Split
-    output_scale: Array  # (r,) √w over the unit, by which rows of C and y were multiplied
+    output_scale: Array  # (r,) √w, or 1 over the unit, by which rows of C and y were multiplied
     dynamics: Array  # (N, k, k) BᵀA_0 B
     from_unknowns: Array  # (N, k, q) BᵀD_0
     from_signals: Array  # (N, k, · + r) Bᵀb_0 = from_signals [v; y], v as the form has it
@@ -176,7 +176,7 @@ def observer_matrices(
 ) -> ObserverMatrices:
     """Evaluate the observer's matrices at the times t (N,), those of the start first.
 
-    Equations and outputs count in the form's units, outputs with √w = ``output_scale`` (r,), and E
+    Equations count in the form's units, outputs as well or with √w = ``output_scale`` (r,), and E
     may have a known ``frame``; or all is as in ``like``, the matrices of other times, whose basis
     is kept. A plant whose matrices follow signals needs [u; y] (N, m + r).
     """
@@ -185,7 +185,7 @@ def observer_matrices(
     if like is not None:
         scale, frame = like.output_scale, like.split.frame
     else:
-        scale = (np.ones(system.r) if output_scale is None else output_scale) / units.outputs
+        scale = 1.0 / units.outputs if output_scale is None else output_scale
     plain = model.hidden is None and {"D", "H"} <= system.coefficients.zero
     # Products with axes have no rounding that would have to be found.
     axes = axes_frame(largest_over_time(model.E)) if like is None and frame is None else frame

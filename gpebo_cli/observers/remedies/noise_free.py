@@ -67,11 +67,12 @@ def _round(reduced: ReducedSystem, found: Observation, eta: Array) -> Observatio
     system, state_map = reduced.system, found.state_map
     assert isinstance(state_map, AffineStateMap)  # noqa: S101  as it is without a remedy
     x = state_map.offset.values + state_map.gain.values @ eta
+    scale, units = reduced.first.output_scale, reduced.form.units
     copy = Linearised(system, Trajectory(state_map.offset.mesh, x), eta[: system.q])
     along = reduced_system(
         replace(system, coefficients=copy), reduced.signals, reduced.solver,
-        weights=((reduced.first.output_scale * reduced.form.units.outputs) ** 2).tolist(),
-        regression=reduced.regression, units=reduced.form.units,
+        weights=None if (scale == 1.0 / units.outputs).all() else (scale**2).tolist(),
+        regression=reduced.regression, units=units,
         form="strangeness_free" if reduced.form.structure else "given",
     )
     return Plain().observe(replace(along, xi_a0=reduced.xi_a0, note=reduced.note))
