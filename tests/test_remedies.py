@@ -580,6 +580,14 @@ def test_what_is_left_of_the_prior_of_a_state_is_told_where_data_are_forgotten(b
         assert found.evidence["alpha_lambda_min_over_f0"] == pytest.approx(ratio, rel=1e-6)
 
 
+def test_what_cancels_but_for_rounding_is_not_resolved():
+    """The kernel of E rotates, and b_0, which vanishes, is what products of the matrices leave."""
+    observer = {"name": "gpebo", "remedy": "current_coordinates"}
+    result = api_run("published/brenan", observer=observer, estimator="least_squares")
+    assert result.details.regression.error_estimate < 1e-10
+    np.testing.assert_allclose(result["x2_hat"][0, -1], np.sin(20.0), atol=1e-10)
+
+
 def test_filters_in_current_coordinates_hold_the_state():
     """Ωζ = 𝒴 for the true ζ, at every point, with rates that differ by row."""
     system, signals, observation = observed("mixed", remedy="current_coordinates")

@@ -22,6 +22,7 @@ import numpy as np
 
 from gpebo_cli.kernels import arrays
 from gpebo_cli.model.descriptor import Array
+from gpebo_cli.numerics.errors import EPS, ROUNDING
 from gpebo_cli.numerics.mesh import Kind, Mesh, Trajectory
 from gpebo_cli.numerics.refinement import resolve
 from gpebo_cli.observers._base import AffineStateMap, Observation
@@ -96,7 +97,14 @@ class CurrentCoordinates:
                 more = np.pad(np.broadcast_to(kernel, (len(t), n, n)), ((0, 0), (0, 0), (q, 0)))
                 a = replace(a, Y=np.pad(a.Y, ((0, 0), (n, 0))), psi=np.hstack([more, a.psi]))
             own = rows * np.append(units, 1.0) / units[q:, None]
-            kinds = (*a.kinds(reduced.form.units.states), (own[..., :p], 0.0), (own[..., p], 0.0))
+            # Rates that do nothing over the horizon may be rough, and what is rounding beside them.
+            of_state, of_known = own[..., :p], own[..., p]
+            fastest = max(float(np.abs(of_state).max(initial=0.0)), 1.0 / duration)
+            rounding = ROUNDING * EPS / solver.tol * fastest
+            kinds = (
+                *a.kinds(reduced.form.units.states), (of_state, 1.0 / duration),
+                (of_known, rounding),
+            )
             seen = [(v.reshape(*times.shape[1:], prod(v.shape[1:])), floor) for v, floor in kinds]
             smallest, where = weakest(o.injectivity, o.elimination)
             return (times, a, rows, (smallest, float(t[where])), seen), seen
