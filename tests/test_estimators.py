@@ -994,6 +994,9 @@ def test_separate_estimators_require_what_one_of_them_lacks(mu):
     assert not required.holds
     assert required.evidence["gamma_times_integral"] == pytest.approx(0.3, abs=0.1)
     assert required.evidence["needed"] == pytest.approx(-np.log(0.1))
+    met = estimators.build({"name": "fct", "mu": mu, "gamma": 1e4}).estimate(CLEAN, T).requirement
+    assert met.holds
+    assert met.evidence["needed"] == pytest.approx(-np.log(1.0 - mu[0]))  # of the first, then
 
 
 @pytest.mark.parametrize(("beta", "more"), [
@@ -1307,6 +1310,7 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
     expected = (vectors * share[:, None]) @ vectors.T
     np.testing.assert_allclose(info.covariance(2.0, 0.5), expected, rtol=1e-9, atol=1e-9)
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
+    np.testing.assert_array_equal(info.solution(2.0, 0.5, np.array(START)), found)  # of each gain
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
     if units is None:  # ‖F‖ of F = (f₀ I + α G)⁻¹ in beside a bound of 4
         forgetting = 0.3 * (1.0 - np.linalg.norm(expected, 2, axis=(1, 2)) / 2.0 / 4.0)

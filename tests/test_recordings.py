@@ -633,6 +633,7 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         ({"V": ["a", "b", "c"]}, "column V: "),
         ({"V": [1.0, np.nan, 2.0]}, "row 1, column V: nan is no number within"),
         ({"t": [0.0, 1.0, 1.0]}, "column t: 1.0 follows 1.0; times must increase"),
+        ({"t": [1.0, 0.5, 2.0]}, "column t: 0.5 follows 1.0; times must increase"),
         ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
         ({"V": [True, False, True]}, "column V: bool"),
         ({"V": [1.0, 2.0, 3j]}, "column V: complex128 is not numbers"),
