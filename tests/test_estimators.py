@@ -959,6 +959,16 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     np.testing.assert_allclose(small, large, rtol=1e-7, atol=1e-12)
 
 
+def test_without_a_gain_an_estimate_moves_as_what_it_estimates():
+    """η' = diag(0, 0.1, −1) η."""
+    mesh, rows = CLEAN.mesh, np.array([[0.0, 0.1, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
+    rows = Trajectory(mesh, np.broadcast_to(rows, (*mesh.points.shape, 2, 4)))
+    made = estimators.build({"name": "gradient", "gamma": 1e-15, "initial": START})
+    found = made.estimate_moving(CLEAN, T, (), Dynamics(rows, np.ones(3)))
+    expected = np.array(START) * np.exp(T[:, None] * [0.0, 0.1, -1.0])
+    np.testing.assert_allclose(found.parameters(slice(None))[0], expected, atol=1e-9)
+
+
 @pytest.mark.parametrize(("weak", "holds"), [(1e-10, True), (1e-8, False)])
 def test_a_prior_in_a_direction_of_rounding_is_not_told_from_rounding(weak, holds):
     """A tenth of F⁻¹ in its weakest direction is not from data, which filters know to 1e-11."""

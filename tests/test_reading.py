@@ -15,7 +15,7 @@ from processes import refused
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.reading import as_seen_from_here, read_bytes
-from gpebo_cli.schema import LARGEST, nearest, number, read
+from gpebo_cli.schema import LARGEST, nearest, number, per_name, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
@@ -128,3 +128,8 @@ def test_whatever_is_contentthe_answer_is_settings_or_one_config_error(mapping):
         return
     assert type(built.tol) is float
     assert type(built.stages) is int
+
+
+@pytest.mark.parametrize("given", ["10", 10, [10, "10"], {"a": "10", "b": 10}])
+def test_a_number_for_every_name_may_come_as_text(given):
+    assert per_name(given, ["a", "b"], "thing", "here").tolist() == [10.0, 10.0]
