@@ -676,14 +676,14 @@ def test_an_estimator_of_ones_own_goes_on_from_window_to_window(monkeypatch):
         np.testing.assert_allclose(cut, whole, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("asked", [None, TIMES / 50.0])
-def test_windows_keep_what_is_asked_for_or_all(asked, monkeypatch):
-    plant, found = shipped("circuit"), []
-    signals = replace(rough(plant, "linear", 40, 0.8), asked=asked, wanted=asked)
+def test_windows_keep_an_extension_everywhere_where_all_of_it_is_asked_for(monkeypatch):
+    """An e₀ that varies with θ is made of it at any time."""
+    plant, found, t = shipped("circuit"), [], TIMES / 50.0
+    signals = rough(plant, "linear", 40, 0.8)
     for window in (10**6, 16):
         monkeypatch.setattr(mesh, "_WINDOW", window)
         made = build({"name": "gpebo"}).observe(plant, signals, SolverSettings())
-        found.append(made.state_map.at(TIMES / 50.0)(np.ones((1, 41, made.regression.p))))
+        found.append(made.truth.extension(t))
     np.testing.assert_allclose(found[1], found[0], atol=1e-9 * np.abs(found[0]).max())
 
 
