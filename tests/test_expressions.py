@@ -437,6 +437,7 @@ def test_values_that_are_no_expressions_are_refused(value: object) -> None:
         ("Cl + 1", "did you mean C1?"),
         ("sine(t)", "did you mean sin?"),
         ("t^2", "write ** for powers"),
+        ("t & 2", "the character '&' has no meaning here; accepted: numbers, names, +"),
         ("1/0", "divides by zero"),
         ("sin", "needs an argument"),
         ("sin(t, t)", "takes one argument, not 2"),
