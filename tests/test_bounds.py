@@ -10,13 +10,14 @@ import pytest
 from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from kernel_paths import by_both
+from processes import refused
 from scipy.integrate import quad
 from scipy.special import gammaln
 from test_kernels_jets import tape_of, texts
 
 from gpebo_cli import run
 from gpebo_cli.errors import ConfigError, GpeboError
-from gpebo_cli.model.expressions.bounds import Bounds, breakpoints, resolved
+from gpebo_cli.model.expressions.bounds import Bounds, _refuse_poles, breakpoints, resolved
 from gpebo_cli.model.expressions.intervals import Interval, polynomials
 from gpebo_cli.model.expressions.syntax import parse, signal
 from gpebo_cli.model.expressions.tape import record
@@ -300,6 +301,15 @@ def test_a_pole_is_refused_wherever_it_stands(pole, place):
         plant[key][row] = pole
     with pytest.raises(GpeboError, match=r"grows beyond all numbers near t = (3\.3;|0.0)"):
         run(plant, observer="none", time={"horizon": 5.03})
+
+
+def test_a_pole_is_no_jump_and_may_stand_in_the_last_element():
+    functions = "1", "9*step(1.5 - t)", "9*step(t - 1.5)", "1/(t - 1.5)"
+    tape, edges = record([parse(text, {}, "here") for text in functions]), np.array([0.0, 1.0, 2.0])
+    alone = np.array([[True, True, True, False]])
+    _refuse_poles(tape, np.array([1.5]), edges, alone)
+    with refused("here = '1/(t - 1.5)' grows beyond all numbers near t = 1.5; choose a horizon"):
+        _refuse_poles(tape, np.array([1.5]), edges, ~alone)
 
 
 @pytest.mark.parametrize(("text", "truth"), [

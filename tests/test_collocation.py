@@ -761,6 +761,14 @@ def test_errors_of_the_start_are_carried_with_the_solution():
                                          for t in mesh.edges[1:])]
     own = np.abs(found.trajectory.values).max(axis=(0, 1))
     np.testing.assert_allclose((found.errors * own)[:, 0], largest, rtol=1e-5)
+    # They come on top of those of the mesh.
+    mesh = initial_mesh(0.0, 2.0, [], 1, radau_rule(4))
+    more, less = (
+        solve(replace(problem, uncertain=size), mesh, tol=0.1, max_elements=1).errors
+        for size in (wrong, None)
+    )
+    assert (less > 1e-5).all()
+    assert (more >= less).all()
 
 
 @pytest.mark.parametrize("apart", [False, True])

@@ -1002,6 +1002,16 @@ def test_a_gain_has_to_beat_the_growth_of_what_moves(share, holds):
     np.testing.assert_allclose(small, large, rtol=1e-7, atol=1e-12)
 
 
+def test_without_a_gain_an_estimate_moves_as_what_it_estimates():
+    """η' = diag(0, 0.1, −1) η."""
+    mesh, rows = CLEAN.mesh, np.array([[0.0, 0.1, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0]])
+    rows = Trajectory(mesh, np.broadcast_to(rows, (*mesh.points.shape, 2, 4)))
+    made = estimators.build({"name": "gradient", "gamma": 1e-15, "initial": START})
+    found = made.estimate_moving(CLEAN, T, (), Dynamics(rows, np.ones(3)))
+    expected = np.array(START) * np.exp(T[:, None] * [0.0, 0.1, -1.0])
+    np.testing.assert_allclose(found.parameters(slice(None))[0], expected, atol=1e-9)
+
+
 @pytest.mark.parametrize(("weak", "holds"), [(1e-10, True), (1e-8, False)])
 def test_a_prior_in_a_direction_of_rounding_is_not_told_from_rounding(weak, holds):
     """A tenth of F⁻¹ in its weakest direction is not from data, which filters know to 1e-11."""
@@ -1037,6 +1047,9 @@ def test_separate_estimators_require_what_one_of_them_lacks(mu):
     assert not required.holds
     assert required.evidence["gamma_times_integral"] == pytest.approx(0.3, abs=0.1)
     assert required.evidence["needed"] == pytest.approx(-np.log(0.1))
+    met = estimators.build({"name": "fct", "mu": mu, "gamma": 1e4}).estimate(CLEAN, T).requirement
+    assert met.holds
+    assert met.evidence["needed"] == pytest.approx(-np.log(1.0 - mu[0]))  # of the first, then
 
 
 @pytest.mark.parametrize(("beta", "more"), [
@@ -1358,6 +1371,7 @@ def test_covariance_and_solution_by_elimination_are_those_of_the_spectrum(units)
         mixed, (vectors * weights[:, None]) @ vectors.T, rtol=1e-8, atol=1e-8 * weights.max()
     )
     found, by_spectrum = (of.solution(2.0, 0.5, np.array(START)) for of in (info, info.spectrum))
+    np.testing.assert_array_equal(info.solution(2.0, 0.5, np.array(START)), found)  # of each gain
     np.testing.assert_allclose(found, by_spectrum, atol=1e-8)
     if units is None:  # ‖F‖ of F = (f₀ I + α G)⁻¹ in beside a bound of 4
         forgetting = 0.3 * (1.0 - np.linalg.norm(expected, 2, axis=(1, 2)) / 2.0 / 4.0)

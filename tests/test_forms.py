@@ -751,14 +751,18 @@ def test_an_output_in_equations_that_nobody_differentiates(load, pushes):
     assert of_states < 1e-9
 
 
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
 @pytest.mark.parametrize("entry", [(4, 0, "sin(a) + seen/50"), (0, 0, "-seen")])
-def test_a_hidden_constraint_that_differentiates_an_output_is_refused(entry):
+def test_a_hidden_constraint_that_differentiates_an_output_is_refused(entry, unit):
     """The rod's constraint is differentiated twice, the positions' equations once."""
-    system = plant_from_mapping(with_entry(*entry))
-    mesh = Mesh(np.linspace(0.0, 1.0, 3), radau_rule(5))
+    start = dict(zip(PENDULUM["states"], PENDULUM["initial_state"], strict=True))
+    plant = {**with_entry(*entry), "initial_state": start}
+    units = Units(*map(np.ones, (5, 1, 2, 1, 5)), unit)._replace(outputs=np.ones(1) / unit)
+    system = plant_from_mapping(in_units(plant, units))
+    mesh = Mesh(np.linspace(0.0, unit, 3), radau_rule(5))
     signal = Trajectory(mesh, np.ones((2, 6, 2)))
     seen = Measurements(
-        signal, Trajectory(mesh, np.ones((2, 6, 1))), None,
+        signal, Trajectory(mesh, mesh.points[..., None] / unit**2), None,  # from zero on
         InputDerivatives.of_signal(signal, np.array([True, True])),
     )
     with pytest.raises(ConfigError, match="contains the derivative of the output seen, which is"):

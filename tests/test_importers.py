@@ -31,6 +31,7 @@ from gpebo_cli.api.choice import plain
 from gpebo_cli.cli.listing import described
 from gpebo_cli.importers import from_control, from_file, from_matrices, from_mechanics, from_netlist
 from gpebo_cli.importers.circuit import circuit_from_netlist
+from gpebo_cli.importers.matrices import _identifiers
 from gpebo_cli.importers.mechanics import linearise
 from gpebo_cli.importers.netlist import number, read_netlist
 from gpebo_cli.model.expressions.syntax import parse
@@ -509,6 +510,8 @@ def test_what_continues_and_what_is_a_comment():
     ("K1 L1 L2 0.5\nL1 a 0 1\nR2 b 0 1", "K1 couples l2, which is no inductor"),
     ("K1 L1 L2\x1b[31m 0.5\nL1 a 0 1", r"K1 couples l2\x1b[31m, which is no inductor"),
     ("L1 a 0 1\nL2 b 0 1\nK1 L1 L2 1.5", "a coupling is at most 1, got 1.5"),
+    ("L1 a 0 1\nL2 b 0 1\nK1 L1 L2 -1.5", "a coupling is at most 1, got -1.5"),
+    ("V1 a 0 PWL()\nR1 a 0 1", "needs pairs of a time and a value"),
     ("R1 a 0 {1", "is not closed"),
     (".subckt s a\nR1 a 0 1\nX1 a s\n.ends\nX1 b s\nR2 b 0 1", "nested more than 20 deep (s)"),
     ("R1=5", "'R1=5' is no element: a name comes first"), ("X1=s", "a name comes first"),
@@ -555,6 +558,7 @@ def test_mistakes_in_netlists(lines, message):
     ("v(q)", None, "there is no node q"), ("i(C1)", None, "whose current"),
     ("sqrt(2)", None, "cannot measure"), (None, "R1", "it is no source"),
     ("y=1e*v(a)", None, "cannot measure 'y=1e*v(a)'"), ("v(0)", None, "ground has no voltage"),
+    ("y=", None, "cannot measure 'y='; write v(node)"),
     (None, "V1", "V1 is '0.0 + 1.0*sin(2*pi*1.0*t)', and an unknown is a constant"),
 ])
 def test_mistakes_in_what_is_asked(measure, unknown, message):
@@ -723,6 +727,8 @@ def test_a_slider_crank_about_its_motion_is_observed_from_one_position():
 def test_mistakes_in_mechanics(change, message):
     with refused(message):
         from_mechanics({**SLIDER_CRANK, **change}, "rod", "rod.yaml")
+    with refused(begins="rod"):  # what is no file has a name
+        from_mechanics({**SLIDER_CRANK, **change}, "rod")
 
 
 def test_a_measured_position_has_its_unit():
@@ -905,6 +911,12 @@ def test_files_of_matrices(tmp_path):
 def test_mistakes_in_matrices(matrices, message):
     with pytest.raises(ConfigError, match=message):
         from_matrices(matrices, "p")
+
+
+def test_names_that_have_nothing_to_stand_in_a_plant_get_a_letter():
+    assert _identifiers({"states": ["+", "2nd", "x_"], "outputs": ["2nd"]}) == {
+        "states": ["x_", "x_2nd", "x"], "outputs": ["y_2nd"],
+    }
 
 
 def test_mistakes_in_what_belongs_to_matrices():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from gpebo_cli.model.descriptor import Array, DescriptorSystem
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.numerics.mesh import Mesh
+from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import SignalNoise, kalman_bucy, observe
 from gpebo_cli.observers._filter_model import NoiseModel, filter_model
 from gpebo_cli.observers._riccati import run_filter
@@ -602,3 +604,20 @@ def test_rounding_of_what_constraints_say_is_not_resolved():
         observer="kalman_bucy", solver={"max_elements": 200}, time={"horizon": 10, "samples": 51},
     )
     assert np.abs(result.details.estimation.parameters).max() < 1e-6
+
+
+def test_the_mesh_of_windows_is_the_one_that_they_were_solved_on(monkeypatch):
+    monkeypatch.setattr("gpebo_cli.numerics.mesh._WINDOW", 2)
+    edges, rule = [[1.0, 1.5, 2.0, 3.0], [3.0, 4.0, 5.0]], radau_rule(3)
+    parts = [
+        SimpleNamespace(
+            mesh=Mesh(np.array(own), rule), error_estimate=error, extras=(),
+            at=lambda t: (t[:, None, None], 2.0 * t[:, None, None]),
+        ) for own, error in zip(edges, (2e-9, 1e-9), strict=True)
+    ]
+    t = np.array([1.0, 2.5, 3.0, 4.5, 5.0])
+    found = kalman_bucy._kept(parts, Mesh(np.arange(1.0, 6.0), rule), t)
+    assert found.mesh.edges.tolist() == [1.0, 1.5, 2.0, 3.0, 4.0, 5.0]
+    assert found.error_estimate == 2e-9
+    P, estimate = found.at(t)
+    np.testing.assert_array_equal(np.stack([P, estimate])[:, :, 0, 0], [t, 2.0 * t])

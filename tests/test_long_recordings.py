@@ -676,6 +676,36 @@ def test_an_estimator_of_ones_own_goes_on_from_window_to_window(monkeypatch):
         np.testing.assert_allclose(cut, whole, rtol=1e-12, atol=1e-12)
 
 
+def test_windows_keep_an_extension_everywhere_where_all_of_it_is_asked_for(monkeypatch):
+    """An e₀ that varies with θ is made of it at any time."""
+    plant, found, t, before = shipped("circuit"), [], TIMES / 50.0, []
+    next_window = extension._Monitor.next_window
+    monkeypatch.setattr(extension._Monitor, "next_window", lambda monitor, size: (
+        next_window(monitor, size), before.append((size, len(monitor._past[0])))
+    )[0])
+    signals = rough(plant, "linear", 40, 0.8)
+    for window in (10**6, 16):
+        monkeypatch.setattr(mesh, "_WINDOW", window)
+        made = build({"name": "gpebo"}).observe(plant, signals, SolverSettings())
+        found.append(made.truth.extension(t))
+    (elements, first), *_, (_, last) = before
+    assert max(first, last) < elements / 2  # what stands in front of a window does not pile up
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9 * np.abs(found[0]).max())
+
+
+def test_memory_is_at_least_that_of_the_map_from_all_parameters_to_all_states(monkeypatch):
+    plant = plant_from_mapping({  # of which η are four initial errors
+        "name": "four", "states": ["a", "b", "c", "e"], "outputs": ["y"], "E": np.eye(4).tolist(),
+        "A": (-np.eye(4)).tolist(), "C": [[1, 1, 1, 1]], "initial_state": [0, 0, 0, 0],
+    })
+    signals = rough(plant, "linear", 40, 0.1)
+    signals = replace(signals, wanted=signals.mesh.edges)
+    least = 8e-9 * signals.mesh.points.size * 4 * plant.n
+    monkeypatch.setattr("gpebo_cli.errors._MOST", least)
+    with pytest.raises(ConfigError, match="what is made of each of the recording's"):
+        signals.check_memory(plant)
+
+
 @pytest.mark.parametrize(("remedy", "name", "limits"), [
     ("none", "drem", (2.0, 0.3)),  # 3 with the state map at all points
     # 6 with all of 𝔸; and filters of all rows add 70 to 90, where windows differ by 4.

@@ -342,6 +342,11 @@ def compare(panels: list[Panel], reference: list[Panel], folder: Path) -> list[s
     return list(differences(panels, path))
 
 
+def test_a_reference_goes_from_the_first_time_to_the_last() -> None:
+    rows = reference_text(decaying(1.0)).splitlines()[1:]
+    assert [float(row.split(",")[0]) for row in rows] == pytest.approx(np.arange(0.0, 20.1, 0.5))
+
+
 def test_a_difference_says_which_curve_where_and_by_how_much(tmp_path: Path) -> None:
     assert compare(decaying(1.0), decaying(1.0), tmp_path) == []
     assert compare(decaying(1.0 + 1e-6), decaying(1.0), tmp_path) == []

@@ -15,7 +15,7 @@ from processes import refused
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.reading import as_seen_from_here, beside, read_bytes
-from gpebo_cli.schema import LARGEST, nearest, number, read
+from gpebo_cli.schema import LARGEST, nearest, number, per_name, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
@@ -135,3 +135,8 @@ def test_a_plant_from_python_may_name_any_file_and_one_of_a_configuration_may_no
     assert beside(os.devnull, "", "inputs.u") == os.devnull
     with pytest.raises(ConfigError, match=rf"inputs\.u: {os.devnull} lies outside of "):
         beside(os.devnull, source, "inputs.u")
+
+
+@pytest.mark.parametrize("given", ["10", 10, [10, "10"], {"a": "10", "b": 10}])
+def test_a_number_for_every_name_may_come_as_text(given):
+    assert per_name(given, ["a", "b"], "thing", "here").tolist() == [10.0, 10.0]

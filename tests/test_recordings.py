@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from time import process_time
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -26,6 +27,7 @@ from gpebo_cli import check, run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.evidence.metrics import STANDING
 from gpebo_cli.experiment.pipeline import run_experiment, stream
+from gpebo_cli.experiment.several import _factor as factor_of
 from gpebo_cli.experiment.several import _joined
 from gpebo_cli.model import archive
 from gpebo_cli.model.plant import plant_from_mapping
@@ -641,6 +643,7 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         ({"V": ["a", "b", "c"]}, "column V: "),
         ({"V": [1.0, np.nan, 2.0]}, "row 1, column V: nan is no number within"),
         ({"t": [0.0, 1.0, 1.0]}, "column t: 1.0 follows 1.0; times must increase"),
+        ({"t": [1.0, 0.5, 2.0]}, "column t: 0.5 follows 1.0; times must increase"),
         ({"t": [0.0, np.nan, 1.0]}, "row 1, column t"),
         ({"V": [True, False, True]}, "column V: bool"),
         ({"V": [1.0, 2.0, 3j]}, "column V: complex128 is not numbers"),
@@ -970,6 +973,8 @@ def test_a_look_at_a_table_with_types(tmp_path):
     savemat(path, {"t": t, "V": both, "y": [[1], [2], [3]], "long": np.zeros(9)})
     found = guess(str(path), shipped("circuit"))
     assert (found.columns, found.missing) == ({"t": "t", "V": "V_1", "y": "y"}, 1)
+    savemat(path, {"V": 9.0 - t, "y": t**2})
+    assert {*guess(str(path), shipped("circuit")).columns.values()} <= {"V", "y"}  # that are there
     savemat(path, {"all": {"t": t, "V": t, "y": t}})
     with refused("lab.mat has no vectors of numbers; fields of a struct"):
         guess(str(path), shipped("circuit"))
@@ -1320,6 +1325,16 @@ def test_what_is_known_at_samples_of_several_files_is_put_one_after_the_other():
     both = _joined([first, second], [0.0, -3.0])
     np.testing.assert_array_equal(both.mesh.edges, [0.0, 1.0, 2.0, 3.0, 5.0])
     np.testing.assert_array_equal(both(np.array([0.0, 2.0, 4.0, 5.0])), [1.0, 3.0, 4.0, 5.0])
+
+
+def test_rows_of_a_recording_have_the_weight_of_its_whole_time():
+    """ψ = 1 and Y = 2 over 10 s, however many elements and rows there are."""
+    regression = SimpleNamespace(
+        factor=None, p=1, mesh=Mesh(np.array([5.0, 6.0, 9.0, 15.0]), radau_rule(3)),
+        psi=lambda t: np.ones((len(t), 1, 1)), Y=lambda t: 2.0 * np.ones((len(t), 1)),
+    )
+    found = factor_of(regression, SimpleNamespace(samples=np.linspace(5.0, 15.0, 41)))
+    np.testing.assert_allclose(found.T @ found, [[10.0, 20.0], [20.0, 40.0]], rtol=1e-12)
 
 
 def test_deviations_of_several_files_are_those_of_independent_data(tmp_path):

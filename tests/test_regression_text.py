@@ -332,6 +332,16 @@ def test_terms_of_an_expression_are_the_largest_that_it_adds_up():
     ])
 
 
+def test_sizes_of_an_operator_do_not_hang_on_when_the_clock_began():
+    text = regression_from_mapping({
+        "name": "x", "unknowns": {"a": 1.0}, "signals": {"u": None}, "Y": ["u"],
+        "psi": [["integral(u)"]],
+    })
+    t, u = 0.1 * np.arange(30), np.ones((30, 1))
+    found = text.advance("linear", None, 50.0 + t, u, u)[1].scale
+    np.testing.assert_allclose(found, text.advance("linear", None, t, u, u)[1].scale, rtol=1e-12)
+
+
 def test_sizes_so_far_are_handed_on_from_piece_to_piece():
     """A signal that decays: later pieces alone would say that nothing was ever larger."""
     text = regression_from_mapping({

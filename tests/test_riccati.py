@@ -470,15 +470,30 @@ def test_a_filter_that_forgets_fast_is_cut_for_it_at_once():
     assert sum(asked) < 15_000  # times, of all meshes that it went through
 
 
-@pytest.mark.parametrize(("elements", "longest"), [(1, np.inf), (20, np.inf), (20, 0.05)])
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+@pytest.mark.parametrize("size", [[0.0, 0.0], [4.0, 0.0], [4.0, 1.0]])
+def test_a_frame_has_all_directions_in_any_unit(size, unit):
+    """P = T X Tᵀ, and T is regular, also where there is no variance."""
+    frame = _stiff_riccati._Frame.of(np.diag(size), unit * np.array([[1.0, 0.5], [0.0, 1.0]]))
+    basis = np.array([[1.0, 0.5], [0.0, 1.0]])
+    found = frame.basis @ frame.left @ frame.basis.T / unit**2
+    np.testing.assert_allclose(found, basis @ np.diag(size) @ basis.T, atol=1e-14)
+    assert np.linalg.cond(frame.basis) < 1e5
+    assert 1e-3 <= np.linalg.norm(frame.basis, axis=0).max() / unit <= 4.0
+
+
+@pytest.mark.parametrize(("elements", "longest"), [
+    (1, np.inf), (20, np.inf), (20, 0.05), (20, 0.0),
+])
 def test_a_filter_that_is_very_fast_follows_on_few_elements(elements, longest, monkeypatch):
     """P' = 2aP + q − P²/V has two roots, P₊ and P₋; (P − P₊)/(P − P₋) decays like exp(−2λt).
 
-    Elements in which Newton's method finds nothing are cut, whatever stands behind them.
+    Elements in which Newton's method finds nothing are cut, whatever stands behind them; and so is
+    the first one, once, where that is all that there is (0.0).
     """
-    element = _stiff_riccati._element
+    element, first = _stiff_riccati._element, [None]
     monkeypatch.setattr(_stiff_riccati, "_element", lambda rule, h, *given: (
-        element(rule, h, *given) if h <= longest else None
+        element(rule, h, *given) if h <= longest or not (longest or first) else first.clear()
     ))
     if np.isfinite(longest):
         monkeypatch.setattr(_stiff_riccati, "_POINTS", 30)  # two elements at once

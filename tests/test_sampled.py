@@ -65,6 +65,13 @@ def regression(K=40, r=2, p=3, hold="zoh", steps=None):
     return SampledRegression(np.cumsum(steps), steps, rows, hold)
 
 
+def in_parts(block, cuts):
+    return [
+        replace(block, t=block.t[a:b], steps=block.steps[a:b], rows=block.rows[a : b + 1])
+        for a, b in pairwise(cuts)
+    ]
+
+
 @pytest.mark.parametrize("name", ["gradient", "mre"])
 def test_what_is_left_of_an_error_is_told_in_no_units(name):
     made, size = regression(), np.array([1.0, 1e3, 1e-2])
@@ -480,11 +487,12 @@ def test_rows_that_were_zero_so_far_are_not_taken():
     own, late = (estimators.build({"name": "lion"}).at_samples(rates) for _ in range(2))
     whole = own.update(block)
     np.testing.assert_array_equal(whole[19:], late.update(part))
-    own, found = estimators.build({"name": "lion"}).at_samples(rates), []
-    for a, b in pairwise([0, 1, 10, 25, 40]):
-        rows = block.rows[a : b + 1]
-        found.append(own.update(replace(block, t=block.t[a:b], steps=block.steps[a:b], rows=rows)))
-    np.testing.assert_allclose(np.concatenate(found), whole, atol=1e-13)
+    for cut in (25, 20):  # the third row wakes within a part, or at its end and is silent behind it
+        block.rows[21, 2] *= cut != 20
+        whole = estimators.build({"name": "lion"}).at_samples(rates).update(block)
+        own = estimators.build({"name": "lion"}).at_samples(rates)
+        found = [own.update(part) for part in in_parts(block, [0, 1, 10, cut, 40])]
+        np.testing.assert_allclose(np.concatenate(found), whole, atol=1e-13)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
@@ -574,6 +582,11 @@ def test_the_new_regressor_is_rotated_over_each_sample(hold):
         assert found.delta[k, 0] == pytest.approx(np.sin(phi), abs=1e-12)
         np.testing.assert_allclose(found.quotient[k, 0] * np.sin(phi), c[1], atol=1e-10)
     assert 0.1 < phi < 1.57
+    own = estimators.build({"name": "exciting", "kappa": kappa, "lambda": 1.0}).recursive("abc")
+    made = [own._mixing(each) for each in in_parts(block, [0, 1, 2, 12, 25])]
+    for field in ("delta", "quotient"):
+        joined = np.concatenate([getattr(part, field) for part in made])
+        np.testing.assert_allclose(joined, getattr(found, field), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["mre", "gradient"])
@@ -666,6 +679,10 @@ def test_the_monotone_law_at_samples(gain):
         "integral_delta_squared": energy, "gamma_times_integral": np.min(gain) * energy,
         "needed": np.log(100.0) / mu,
     }, rel=1e-9)
+    own = built.recursive(["e", "f", "g"])
+    parts = [own.update(part) for part in in_parts(replace(block, parametrisation=S), [0, 9, 25])]
+    joined = np.concatenate([part.parameters for part in parts], axis=1)
+    np.testing.assert_allclose(joined, eta, rtol=1e-9)
     if gain == 5.0:
         for k, omega in enumerate(extended[..., :3]):
             x = gain * np.linalg.det(omega) ** 2 * block.steps[k]

@@ -20,9 +20,11 @@ from scipy.special import beta
 from gpebo_cli import GpeboError, run
 from gpebo_cli.errors import ModelError, SolverError
 from gpebo_cli.model.plant import plant_from_mapping
+from gpebo_cli.numerics import collocation
 from gpebo_cli.numerics.mesh import Mesh
 from gpebo_cli.numerics.problem import LinearEquation, LinearProblem
 from gpebo_cli.numerics.radau import radau_rule
+from gpebo_cli.numerics.refinement import RoundingError
 from gpebo_cli.reduction import structure
 from gpebo_cli.settings import SolverSettings, TimeSettings
 from gpebo_cli.simulation import ivp
@@ -864,3 +866,23 @@ def test_a_little_state_is_compared_with_a_share_of_the_largest_by_ivp():
     solver = SolverSettings("ivp")
     errors = simulate(plant_from_mapping(plant), TimeSettings(horizon=0.5), solver).state_errors
     assert errors.max() < 1e-4
+
+
+@pytest.mark.parametrize("unit", [1.0, 2.0**-30, 2.0**30])
+def test_beside_states_of_any_unit_one_that_is_zero_is_measured_by_them(unit, monkeypatch):
+    """Where everything was rounding of zero, a thousandth of the largest is what counts next."""
+    asked, size = [], np.array([1.0, unit])
+
+    def solve(problem, **rest):
+        asked.append(problem.floor.ravel() / size)
+        if len(asked) == 1:
+            raise RoundingError("rounding", (None, np.ones((2, 3, 2, 1)) * size[:, None]))
+        return collocation.solve(problem, **rest)
+
+    monkeypatch.setattr("gpebo_cli.simulation.simulate.solve", solve)
+    simulate(plant_from_mapping(one_state(
+        states=["a", "b"], E=[[1, 0], [0, 1]], A=[[-2, 1 / unit], [unit, -2]], C=[[1, 0]],
+        initial_state=[0, 0],
+    )), TimeSettings(horizon=0.5), SolverSettings())
+    np.testing.assert_array_equal(asked[0], 0.0)
+    np.testing.assert_allclose(asked[1], 1e-3, rtol=0.5)

@@ -617,8 +617,9 @@ def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
     from gpebo_cli.results.comparison import _heat_map
 
     x = np.array([1.0, 10.0])
-    figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "")
+    figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "drem")
     assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
+    assert "drem" in figure.axes[0].get_title(loc="left")  # which runs they are
     (image,), low, high = figure.axes[0].images, np.min(values), np.max(values)
     middle = np.sqrt(low * high) if high == 1000 else (low + high) / 2
     assert image.norm(middle) == pytest.approx(0.5)

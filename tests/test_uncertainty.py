@@ -19,7 +19,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.metrics import settling_times
-from gpebo_cli.evidence.uncertainty import _layered, deviations, noise_level
+from gpebo_cli.evidence.uncertainty import _agree, _layered, deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.experiment.result import Fit
@@ -796,6 +796,13 @@ def test_a_large_gain_leaves_the_filters_in_front_of_it_alone(gain, c):
     (f, s), decayed = error_maps(mesh, mesh.steps, A, B)[0, -1], np.exp(-a * h)
     np.testing.assert_allclose(f, [decayed, 0.0, (1.0 - decayed) / a], rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(s, c * f, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e9])
+def test_elements_agree_on_deviations_in_any_unit(unit):
+    fine = unit * np.array([[1.0], [1e-3], [np.nan]])
+    assert _agree(1.0001 * fine, fine)
+    assert not _agree(fine * [[1.0], [1.5], [1.0]], fine)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])

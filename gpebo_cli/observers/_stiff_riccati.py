@@ -69,7 +69,7 @@ def of_covariance(
         tail, whole = np.zeros(mesh.size), len(frames) - 1
         if whole and problem.monitor is not None:
             kinds = problem.monitor(values[:whole], tuple(extra[:whole] for extra in extras))
-            tail[:whole] = unresolved_kinds(kinds, mesh.rule)[-whole:]
+            tail[:whole] = unresolved_kinds(kinds, mesh.rule)
         tail[whole:][:1] = 1.0  # what follows it is not known
         return found, tail
 
