@@ -19,7 +19,14 @@ from gpebo_cli.estimators._mixed import FilteredEstimator, MixedEstimates, reach
 from gpebo_cli.estimators._recursive import InformationRoot, KreisselmeierFilter, ScalarLaw
 from gpebo_cli.estimators._registry import able, build, names, settings_of
 from gpebo_cli.estimators._scalar import kreisselmeier, lion, low_pass, mix
-from gpebo_cli.estimators._segments import errors, estimate, goes_on, tuned, tuned_for
+from gpebo_cli.estimators._segments import (
+    at_samples,
+    errors,
+    estimate,
+    goes_on,
+    tuned,
+    tuned_for,
+)
 from gpebo_cli.estimators._vector import VectorEstimates, VectorLaw
 from gpebo_cli.evidence.excitation import persistent
 from gpebo_cli.findings import Requirement
@@ -52,7 +59,7 @@ __all__ = [
     "Recursion", "Recursive", "Requirement", "Reset", "Resumable", "ResumableEstimates",
     "ResumableEstimator", "SampledEstimates", "SampledRegression", "ScalarLaw", "Trajectory",
     "VectorEstimates", "VectorLaw", "WindowEstimates", "Windowed", "WindowedEstimator", "able",
-    "axis", "build", "combinations", "errors", "estimate", "gain", "goes_on", "information",
-    "kreisselmeier", "lion", "low_pass", "mix", "names", "number", "per_name", "persistent",
-    "reached", "settings_of", "tuned", "tuned_for",
+    "at_samples", "axis", "build", "combinations", "errors", "estimate", "gain", "goes_on",
+    "information", "kreisselmeier", "lion", "low_pass", "mix", "names", "number", "per_name",
+    "persistent", "reached", "settings_of", "tuned", "tuned_for",
 ]

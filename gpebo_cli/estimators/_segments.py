@@ -22,19 +22,26 @@ from gpebo_cli.regression.estimator import (
     Estimator,
     Found,
     Moving,
+    Recursion,
+    Recursive,
     Resumable,
     ResumableEstimates,
+    SampledEstimates,
     Windowed,
     WindowEstimates,
 )
 from gpebo_cli.regression.linear import LinearRegression
 from gpebo_cli.regression.resets import ExtensionState, Known, Reset
+from gpebo_cli.regression.samples import SampledRegression
 
 GoOn = Callable[[LinearRegression, Array, Known], WindowEstimates]  # from a window to the next
 
 _FOLLOW = "observer.remedy=current_coordinates needs an estimator that can follow a state"
 _GO_ON = "observer.remedy=reset needs an estimator that can go on after a reset"
+_AT_SAMPLES = "observer.sample_time and streams need an estimator that works at samples"
 _MOST = 1 << 23  # numbers of estimates of all cases, which are held at once
+# Constraints alone determine the states.
+_NOTHING = Requirement("none", True, {}, "there is nothing to estimate")
 
 
 def tuned(estimator: Estimator, regression: LinearRegression) -> Estimator:
@@ -72,9 +79,8 @@ def estimate(
     if isinstance(estimator, Several):
         each = [estimate(member, regression, t, shown) for member in estimator.members]
         return SeveralEstimates(tuple(each), tuple(len(m.cases) for m in estimator.members))
-    if not regression.p:  # constraints alone determine the states
-        nothing = Requirement("none", True, {}, "there is nothing to estimate")
-        return Found(np.zeros((len(estimator.cases), len(t), 0)), nothing)
+    if not regression.p:
+        return Found(np.zeros((len(estimator.cases), len(t), 0)), _NOTHING)
     if not regression.resets:
         moving: GoOn | None = None
         if regression.dynamics is not None:
@@ -98,6 +104,26 @@ def estimate(
         times = np.append(own, segment.mesh.edges[-1])
         parts.append(resumable.resume(segment, times, known))
     return Chain(tuple(parts), regression.resets)
+
+
+@dataclass(frozen=True)
+class _Idle:
+    """A recursion without parameters, of so many cases."""
+
+    cases: int
+    requirement: Requirement = _NOTHING
+
+    def update(self, regression: SampledRegression) -> SampledEstimates:
+        return SampledEstimates(np.zeros((self.cases, len(regression.t), 0)), None)
+
+
+def at_samples(estimator: Estimator, parameters: Sequence[str]) -> Recursion:
+    """``estimator.recursive`` for parameters of these names, of which there may be none.
+
+    ConfigError: it does not work at samples, or a setting of it does not.
+    """
+    made = able(estimator, Recursive, _AT_SAMPLES).recursive(parameters)
+    return made if parameters else _Idle(len(estimator.cases))
 
 
 def in_windows(go_on: GoOn, regression: LinearRegression, t: Array, shown: Array) -> Found:

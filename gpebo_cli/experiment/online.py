@@ -108,10 +108,8 @@ class Online:
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
         self.parameters = self._observer.parameters
         self._columns = np.arange(len(self.parameters)) if columns is None else columns
-        self._recursion = estimators.able(
-            estimator, estimators.Recursive,
-            "observer.sample_time and streams need an estimator that works at samples",
-        ).recursive(tuple(self.parameters[j] for j in self._columns))
+        own = tuple(self.parameters[j] for j in self._columns)
+        self._recursion = estimators.at_samples(estimator, own)
         self._gram = InformationRoot(len(self.parameters), np.zeros(1))
         self._tol = max(settings.solver.tol, TOLERANCE)
         self._rho = settings.excitation.rho
