@@ -777,14 +777,16 @@ def test_every_estimator_runs_at_samples_and_one_that_cannot_says_which_can():
 @pytest.mark.parametrize("name", [n for n in estimators.names() if n != "monotone"])
 def test_without_parameters_constraints_determine_the_states_at_samples_too(name):
     """x1 = (1 + t) e⁻ᵗ and x2 = e⁻ᵗ follow from the input alone."""
+    time = {"horizon": 2, "samples": 5}
     result = gpebo_cli.run(
-        "published/gelda", estimator=name, observer={"sample_time": 0.1},
-        time={"horizon": 2, "samples": 5},
+        "published/gelda", estimator=name, observer={"sample_time": 0.1}, time=time
     )
     t = result.t
     assert result.details.estimation.requirement.text == "there is nothing to estimate"
     np.testing.assert_allclose(result["x1_hat"][0], (1.0 + t) * np.exp(-t), rtol=1e-9)
     np.testing.assert_allclose(result["x2_hat"][0], np.exp(-t), rtol=1e-9)
+    noise = {"name": "gaussian", "seeds": 3}
+    assert gpebo_cli.run("published/gelda", estimator=name, noise=noise, time=time).verdict
 
 
 @pytest.mark.parametrize("name", NOT_ALONG_RESETS)

@@ -123,7 +123,7 @@ def continuous(
     if fit is not None and settings.uncertainty:
         fit = replace(fit, ratio=residual_ratio(observation.evidence or observation, source))
     noise = None
-    if settings.noise.seeds > 1 and source.true is not None:
+    if settings.noise.seeds > 1 and source.true is not None and observation.parameters:
         with stage("seeds") as pace:
             noise = over_seeds(
                 observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
