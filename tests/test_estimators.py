@@ -22,6 +22,7 @@ from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
 from gpebo_cli.estimators._mixed import energy_requirement
+from gpebo_cli.estimators._registry import SeveralEstimates
 from gpebo_cli.estimators._scalar import (
     _element_maps,
     kreisselmeier,
@@ -1509,6 +1510,15 @@ def test_each_of_several_estimators_has_a_gain_of_its_own():
         return [case["gamma"] for case in found.cases]
 
     assert gains(delay=[0.2, 0.4]) == pytest.approx([*gains(delay=0.2), *gains(delay=0.4)])
+
+
+def test_several_estimators_have_delta_of_all_or_none():
+    t = np.array([0.0, 1.0, 2.0])
+    one, other = (SimpleNamespace(delta=lambda t, k=k: k * t) for k in (2.0, 3.0))
+    both = SeveralEstimates((one, other), (1, 2)).delta(t)
+    np.testing.assert_array_equal(both, [2.0 * t, 3.0 * t, 3.0 * t])
+    without = SimpleNamespace(delta=lambda _: None)
+    assert SeveralEstimates((one, without), (1, 2)).delta(t) is None
 
 
 def test_a_gain_that_no_data_ask_for_is_the_usual_one():
