@@ -38,7 +38,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares, one_over_memory
-from gpebo_cli.estimators.power import _resolved
+from gpebo_cli.estimators.power import PowerEstimates, _resolved
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.findings import would_do
@@ -385,6 +385,15 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
     near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=start, **rates)
     needed = 0.1 ** (1.0 - alpha) / (1.0 - alpha)
     assert near.requirement.evidence["needed"] == pytest.approx(needed)
+
+
+def test_what_the_power_law_needs_is_told_by_the_last_quotient():
+    path = SimpleNamespace(quotient=np.array([[[9.0, 7.0], [8.0, 6.0]], [[5.0, 4.0], [3.0, 1.0]]]))
+    made = SimpleNamespace(
+        groups=[path], energies=[1.0], start=np.ones(1), alpha=0.5, gains=np.ones((1, 1)),
+    )
+    found = PowerEstimates.requirement.fget(made)  # |3 − 1|^½ / ½
+    assert found.evidence["needed"] == pytest.approx(2.0 * np.sqrt(2.0))
 
 
 @pytest.mark.parametrize("size", [1e-70, 1e-77, 1e-81])
