@@ -14,7 +14,6 @@ from gpebo_cli.model.expressions.syntax import parse, signal
 from gpebo_cli.model.expressions.tape import record
 from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
-from gpebo_cli.regression.operators import Operator, OperatorState
 from gpebo_cli.regression.text import regression_from_mapping, signals_of_time
 from gpebo_cli.settings import SolverSettings, TimeSettings
 
@@ -300,19 +299,6 @@ def test_what_comes_later_changes_no_estimate_of_the_past(estimator):
         one.estimation.parameters[:, told], past[:, told], rtol=1e-4, atol=1e-6
     )
     assert np.abs(past).max() < 2.1
-
-
-@pytest.mark.parametrize("hold", ["zoh", "linear"])
-@pytest.mark.parametrize("name", ["integral", "lp", "hp", "delay"])
-def test_operators_go_on_at_samples_where_they_stood(name, hold):
-    t = np.cumsum([0.0, 0.1, 0.3, 0.2, 0.1, 0.4, 0.2])
-    x, operator = np.cos(5.0 * t), Operator(name, None, 0.35)
-    state = start = OperatorState(t[:1], x[:1])
-    whole, parts = operator.carried(hold, start, t, x)[0], []
-    for part in (slice(0, 2), slice(2, 5), slice(5, 7)):
-        values, state = operator.carried(hold, state, t[part], x[part])
-        parts.append(values)
-    np.testing.assert_allclose(np.concatenate(parts), whole, rtol=1e-13, atol=1e-15)
 
 
 def test_no_operator_is_larger_than_its_terms():
