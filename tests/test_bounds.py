@@ -312,6 +312,12 @@ def test_a_pole_is_no_jump_and_may_stand_in_the_last_element():
         _refuse_poles(tape, np.array([1.5]), edges, ~alone)
 
 
+def test_nothing_is_looked_at_before_the_start():
+    tape, whole = record([parse("log(t)", {}, "here")]), np.array([0.0, 1.0])
+    with refused("here = 'log(t)' has no finite value at t = 0"):  # and not at −4e-13
+        _refuse_poles(tape, np.array([1e-15]), whole, np.array([[True]]))
+
+
 @pytest.mark.parametrize(("text", "truth"), [
     ("1/(1 + (t - 3.3)**(-2))", lambda t: (t - 3.3) ** 2 / (1 + (t - 3.3) ** 2)),
     ("sin(t - 3.3)/(t - 3.3)", lambda t: np.sinc((t - 3.3) / np.pi)),

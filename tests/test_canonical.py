@@ -116,7 +116,7 @@ def test_the_output_that_is_asked_for_is_the_one_of_zw():
 def test_zb3_is_estimated_where_an_output_sees_it_at_every_time(sign, sees, known):
     system = shipped(
         "canonical", outputs=["y1", "y2", "y3"],
-        C=[[1, 0, 0, 0, 0], [0.5, 0, f"{sign}c1", f"{sign}c2", 0], [0, 1, 0, 0, sign + sees]],
+        C=[[0, 1, 0, 0, sign + sees], [1, 0, 0, 0, 0], [0.5, 0, f"{sign}c1", f"{sign}c2", 0]],
     )
     result = run(system)
     error = result.estimation.states[0, -1] - result.simulation.states[-1]

@@ -22,6 +22,7 @@ from gpebo_cli.errors import ConfigError, SolverError
 from gpebo_cli.estimators import LinearRegression, Trajectory, _segments
 from gpebo_cli.estimators._information import InformationAt, information, prior_units
 from gpebo_cli.estimators._mixed import energy_requirement
+from gpebo_cli.estimators._registry import SeveralEstimates
 from gpebo_cli.estimators._scalar import (
     _element_maps,
     kreisselmeier,
@@ -37,7 +38,7 @@ from gpebo_cli.estimators.drem import Drem, follow
 from gpebo_cli.estimators.fct import FiniteTime
 from gpebo_cli.estimators.least_squares import solved
 from gpebo_cli.estimators.ls_drem import LsDrem, mix_least_squares, one_over_memory
-from gpebo_cli.estimators.power import _resolved
+from gpebo_cli.estimators.power import PowerEstimates, _resolved
 from gpebo_cli.experiment import accuracy
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
 from gpebo_cli.findings import would_do
@@ -384,6 +385,15 @@ def test_the_power_law_is_exact_after_a_finite_time_and_not_before(alpha, gamma2
     near = estimate("power", CLEAN, gamma=gamma, alpha=alpha, initial=start, **rates)
     needed = 0.1 ** (1.0 - alpha) / (1.0 - alpha)
     assert near.requirement.evidence["needed"] == pytest.approx(needed)
+
+
+def test_what_the_power_law_needs_is_told_by_the_last_quotient():
+    path = SimpleNamespace(quotient=np.array([[[9.0, 7.0], [8.0, 6.0]], [[5.0, 4.0], [3.0, 1.0]]]))
+    made = SimpleNamespace(
+        groups=[path], energies=[1.0], start=np.ones(1), alpha=0.5, gains=np.ones((1, 1)),
+    )
+    found = PowerEstimates.requirement.fget(made)  # |3 − 1|^½ / ½
+    assert found.evidence["needed"] == pytest.approx(2.0 * np.sqrt(2.0))
 
 
 @pytest.mark.parametrize("size", [1e-70, 1e-77, 1e-81])
@@ -1509,6 +1519,15 @@ def test_each_of_several_estimators_has_a_gain_of_its_own():
         return [case["gamma"] for case in found.cases]
 
     assert gains(delay=[0.2, 0.4]) == pytest.approx([*gains(delay=0.2), *gains(delay=0.4)])
+
+
+def test_several_estimators_have_delta_of_all_or_none():
+    t = np.array([0.0, 1.0, 2.0])
+    one, other = (SimpleNamespace(delta=lambda t, k=k: k * t) for k in (2.0, 3.0))
+    both = SeveralEstimates((one, other), (1, 2)).delta(t)
+    np.testing.assert_array_equal(both, [2.0 * t, 3.0 * t, 3.0 * t])
+    without = SimpleNamespace(delta=lambda _: None)
+    assert SeveralEstimates((one, without), (1, 2)).delta(t) is None
 
 
 def test_a_gain_that_no_data_ask_for_is_the_usual_one():

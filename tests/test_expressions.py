@@ -531,6 +531,7 @@ def test_a_value_that_is_not_finite_inside_an_interval() -> None:
     (lambda x: x**2, -1.0, 2.0, 0.0, 4.0), (lambda x: x**3, -2.0, 1.0, -8.0, 1.0),
     (lambda x: x**1026, -1.0, 0.5, 0.0, 1.0), (lambda x: x**1027, -1.0, 0.5, -1.0, 0.0),
     (lambda x: x**1.5, 1.0, 4.0, 1.0, 8.0), (lambda x: x**1.5, -2.0, -1.0, -np.inf, np.inf),
+    (lambda x: x**1.5, -1.0, 4.0, 0.0, 8.0),
     (lambda x: x**-2.5, 1.0, 4.0, 1 / 32, 1.0), (lambda x: x**-2.5, -1.0, 4.0, -np.inf, np.inf),
 ])
 def test_bounds_of_waves_and_powers_hold_their_crests_and_poles(function, low, high, least, most):
@@ -607,6 +608,12 @@ def test_roots_whose_slope_would_be_nothing_over_nothing_are_known(text: str, sa
     for one, other in zip(derivatives(text, t, 1), derivatives(same, t, 1), strict=True):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(*(breakpoints(record([read(x)]), 0.0, 7.0) for x in (text, same)))
+
+
+def test_a_root_of_one_less_another_square_is_none_of_these() -> None:
+    value, slope = derivatives("sqrt(1 - exp(-t)**2)", np.array([1.0]), 1)
+    root = np.sqrt(1 - np.exp(-2.0))
+    assert (value[0], slope[0]) == pytest.approx((root, np.exp(-2.0) / root), rel=1e-14)
 
 
 @pytest.mark.parametrize(

@@ -143,6 +143,14 @@ def test_what_does_not_fit_is_named(changes, message):
         circuit(**changes).coefficients.taylor(np.array([1.0, 2.0, 3.0]), 0)
 
 
+def test_entries_of_functions_of_inputs_are_those_along_the_plants_own():
+    found = system_from_functions(
+        "known", E=[[1]], A=lambda t, u: u[:, :, None] ** 2, C=[[1]], B=[[1]],
+        u=lambda t: np.cos(t)[:, None], initial_state=[0],
+    ).coefficients.entries(np.array([0.5]), 1).of("A")[0, 0]
+    np.testing.assert_allclose(found[:, 0], [np.cos(0.5) ** 2, -np.sin(1.0)], atol=1e-12)
+
+
 def test_a_plant_has_arrays_of_its_own():
     """Whoever gave them may go on with others, as in a loop over plants."""
     A, C, theta, start = -np.eye(2), np.eye(2), np.ones(1), np.ones(2)

@@ -277,7 +277,7 @@ def damped(t, since):
         t, [0.5, 0.75, 1.5, 2, 2.5, 2.75, 3.5, 4], [1, 3, 3, 1, 1, 3, 3, 1])),
     ("PULSE(0 2 1 0.5 0.25 2)", lambda t: np.interp(t, [1, 1.5, 3.5, 3.75], [0, 2, 2, 0])),
     ("DC 0 AC 1 SIN(0 1 1)", lambda t: np.sin(2 * np.pi * t)),
-    ("AC {1} 0 DC 5", lambda t: 5 + 0 * t),
+    ("AC {1} 0 DC 5", lambda t: 5 + 0 * t), ("AC '1*1' 0 DC '2*3'", lambda t: 6 + 0 * t),
     ("DC 2 AC 1", lambda t: 2 + 0 * t), ("", lambda t: 0 * t),
 ])
 def test_sources_are_those_of_spice(source, expected):
@@ -497,7 +497,8 @@ def test_what_continues_and_what_is_a_comment():
     ("V1 a a 1\nR1 a 0 1", "line 2: V1 closes a loop of voltage sources, or is shorted"),
     ("I1 0 a 1\nI2 a 0 1\nR1 b 0 1", "line 2: I1 drives a current"),
     ("R1 a 0 0", "line 2: R1 has the value 0"),
-    ("R1 a 0", "R1 needs one value"),
+    ("R1 a 0", "R1 needs one value, a number or {expression}; got none"),
+    ("R1 a 0 1 k", "R1 needs one value, a number or {expression}; got 1 k"),
     ("R1 a 0 {foo*2}", "R1 uses foo, which is neither a parameter nor a function"),
     ("R1 a 0 1\nR1 a 0 2", "line 3: R1 stands in line 2 already"),
     ("D1 a 0 mod", "elements are R, L, C"),
@@ -765,6 +766,16 @@ def test_more_than_fifty_states_are_in_an_archive(n, names, tmp_path):
     found = load_plant(tmp_path / "many.yaml").coefficients.taylor(np.zeros(1), 0)
     for name in "ABC":
         np.testing.assert_array_equal(getattr(found, name)[0, 0], getattr(system, name))
+
+
+def test_what_follows_time_stays_in_the_text_of_a_large_plant():
+    states = "".join(f"R{k} n{k - 1} n{k} 1\nC{k} n{k} 0 1\n" for k in range(1, 60))
+    text = f"many\nV1 n0 0 1\n{states}L1 n9 n0 {{2 + sin(time)}}\n"
+    draft = from_netlist(text, "many")
+    assert "E" not in draft.archived()
+    t = np.array([0.0, 1.0])
+    E = plant_from_mapping(draft.mapping()).coefficients.taylor(t, 0).E[0]
+    assert (E[0] != E[1]).any()
 
 
 LEAK = (

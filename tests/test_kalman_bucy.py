@@ -621,3 +621,5 @@ def test_the_mesh_of_windows_is_the_one_that_they_were_solved_on(monkeypatch):
     assert found.error_estimate == 2e-9
     P, estimate = found.at(t)
     np.testing.assert_array_equal(np.stack([P, estimate])[:, :, 0, 0], [t, 2.0 * t])
+    P, _ = kalman_bucy._kept(parts, Mesh(np.arange(1.0, 6.0), rule), None).at(t[[0, -1]])
+    np.testing.assert_array_equal(P[:, 0, 0], [1.0, 5.0])  # the ends, where no times are asked for

@@ -124,15 +124,21 @@ def _series(
     )
 
 
-def _stiff(rng, k=5, s=4, c=2, forced=1, kicked=True, one=False):
-    """A ring of five states, which elimination fills, one row of it empty."""
-    rows, columns = np.array([0, 3, 6, 9, 9, 12]), np.array([0, 1, 4, 0, 1, 2, 1, 2, 3, 0, 3, 4])
+# Columns of each row: a ring of five states, which elimination fills, one row of it empty; and a
+# pattern in which it fills the place of the very first entry.
+RING = (0, 1, 4), (0, 1, 2), (1, 2, 3), (), (0, 3, 4)
+FILLED = (1, 2, 3), (2, 3), (1, 2), (0, 1, 3)
+
+
+def _stiff(rng, k=5, s=4, c=2, forced=1, kicked=True, one=False, pattern=RING):
+    columns, d = np.concatenate(pattern).astype(np.intp), len(pattern)
+    rows = np.cumsum([0, *map(len, pattern)])
     points = 1 if one else k * (s + 1)
     return (
         radau_rule(s).differentiation, np.full(k, 0.3) if one else rng.uniform(0.1, 0.3, size=k),
-        *steps_of(rows.tobytes(), columns.tobytes()), rng.normal(size=(points, 12)),
-        rng.normal(size=(points, 5, forced)), rng.normal(size=(k, 5, c)) if kicked else None,
-        rng.normal(size=(5, c)),
+        *steps_of(rows.tobytes(), columns.tobytes()), rng.normal(size=(points, len(columns))),
+        rng.normal(size=(points, d, forced)), rng.normal(size=(k, d, c)) if kicked else None,
+        rng.normal(size=(d, c)),
     )
 
 
@@ -308,7 +314,7 @@ CASES: list[tuple[str, str, Case]] = [
         {"rate": 30.0},  # no series converges
     )),
     *(("elements", "stiff", partial(_stiff, **options)) for options in (
-        {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False},
+        {}, {"s": 14, "c": 1, "one": True}, {"forced": 0, "kicked": False}, {"pattern": FILLED},
     )),
     ("signals", "tails", _signal),
     ("signals", "tails", partial(_signal, k=1, s=2, c=17)),

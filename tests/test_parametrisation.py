@@ -293,6 +293,9 @@ def test_places_of_the_box_without_a_value_are_named():
     made = replace(given()[0], parametrisation=p)
     with pytest.raises(ConfigError, match=r"S\[0\] .* has no finite value at a = 0\.\d+, b = "):
         estimators.build(MONOTONE).estimate(made, np.array([1.0]))
+    theta = np.array([[1.0, 1.0], [0.25, 2.0], [3.0, 1.0]])  # the second of these is the one
+    with pytest.raises(ConfigError, match=r"S\[0\] .* at a = 0\.25, b = 2, in the box$"):
+        p.values(theta)
     with pytest.raises(ConfigError, match=r"a = 7 is not within its box, \[[\d.]+, [\d.]+\]"):
         regression_from_mapping({**TEXT, "unknowns": {"a": 7, "b": 0.5}})
 

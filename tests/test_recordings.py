@@ -610,6 +610,8 @@ def test_dates_are_seconds_after_the_first(tmp_path):
     others = ["31.5.2024 9:00:00", "31.05.2024 09:00:00,5", "2024-05-31T09:00:00.5000001"]
     for day, t in zip(others, [0.0, 0.5, 0.5000001], strict=True):
         assert seconds([day], seconds(others[:1], None)[1])[0] == pytest.approx([t], rel=1e-15)
+    summer = ["2024-03-31T01:59:00+01:00", "2024-03-31T03:00:00+02:00"]  # a minute later in Berlin
+    assert seconds(summer, None)[0].tolist() == [0.0, 60.0]
     path.write_text("t,V,y\n" + "".join(f"{day},1,2\n" for day in [days[0], "29/02/2024"]))
     with pytest.raises(ConfigError, match=r"line 3, column t: '29/02/2024' is not a date"):
         read(path, time_unit="datetime")
@@ -635,6 +637,16 @@ def test_data_frames_parquet_and_mat_are_the_same_recording(tmp_path):
         assert table.samples.t.tolist() == rows["t"]
         assert table.samples.inputs[:, 0].tolist() == rows["V"]
         assert table.samples.outputs[:, 0].tolist() == rows["y"]
+
+
+def test_durations_of_a_data_frame_begin_where_they_say(tmp_path, monkeypatch):
+    t = pd.to_timedelta([10.0, 10.5, 12.0], unit="s")
+    frame = pd.DataFrame({"t": t, "V": 1.0, "y": 2.0})
+    assert read("", frame=frame).samples.t.tolist() == [10.0, 10.5, 12.0]
+    (tmp_path / "r.parquet").touch()
+    monkeypatch.setattr("gpebo_cli.recordings.guess.typed_table", lambda *_: frame)
+    found = guess(str(tmp_path / "r.parquet"), shipped("circuit"))
+    assert (found.columns["t"], found.time_unit, found.doubts) == ("t", "s", [])
 
 
 @pytest.mark.parametrize(
@@ -973,6 +985,8 @@ def test_a_look_at_a_table_with_types(tmp_path):
     savemat(path, {"t": t, "V": both, "y": [[1], [2], [3]], "long": np.zeros(9)})
     found = guess(str(path), shipped("circuit"))
     assert (found.columns, found.missing) == ({"t": "t", "V": "V_1", "y": "y"}, 1)
+    savemat(path, {"t": t, "V": both.T, "y": t, "long": np.zeros(9)})  # signals are rows
+    assert guess(str(path), shipped("circuit")).columns == {"t": "t", "V": "V_1", "y": "y"}
     savemat(path, {"V": 9.0 - t, "y": t**2})
     assert {*guess(str(path), shipped("circuit")).columns.values()} <= {"V", "y"}  # that are there
     savemat(path, {"all": {"t": t, "V": t, "y": t}})

@@ -742,6 +742,11 @@ def test_the_level_that_is_asked_for_is_reached_at_a_sample():
     ).details.excitation
     reached = found.t[found.gram_eigenvalues[:, 0] >= 1e-3]
     assert found.t_c == reached[0] > found.t[1]
+    never = gpebo_cli.run(
+        "circuit", observer={"sample_time": 0.1}, excitation={"rho": 1e9}, estimator="ls_drem",
+        time={"horizon": 1.0, "samples": 11},
+    ).details.excitation
+    assert never.t_c is None
 
 
 def test_what_is_told_apart_but_never_well_is_exciting_since_then():

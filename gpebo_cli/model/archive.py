@@ -112,7 +112,7 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
         raise ConfigError(
             f"{path} cannot be read ({shown(str(error))}); save it with -v7"
         ) from None
-    return {name: found[name] for name in numbers if name in found}
+    return {name: found[name] for name in numbers}
 
 
 def _unpacked(content: bytes) -> int:
