@@ -620,6 +620,7 @@ def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
     figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "drem")
     assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
     assert "drem" in figure.axes[0].get_title(loc="left")  # which runs they are
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("γ", "f₀")
     (image,), low, high = figure.axes[0].images, np.min(values), np.max(values)
     middle = np.sqrt(low * high) if high == 1000 else (low + high) / 2
     assert image.norm(middle) == pytest.approx(0.5)
