@@ -545,6 +545,7 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
     assert [(curve.label, curve.y.tolist()) for curve in first.curves] == [("quiet", [1e-9] * 3)]
     assert first.curves[0].x.tolist() == [1.0, 10.0, 100.0]
+    assert first.curves[0].style.dots  # where runs are
     again = replace(quiet[0], run="again/1", chosen={"gamma": 10.0, "plant": "p"})
     (first, *_) = metric_panels([*quiet, again], "gamma")
     assert [curve.label for curve in first.curves] == ["quiet"]  # one run's own curve
