@@ -738,8 +738,9 @@ def test_the_power_law_at_samples_needs_what_its_start_is_off():
 
 def test_filters_take_rows_in_turn_however_many_there_are():
     """Row i of the extension is row i mod r of the r that are not zero so far: of 40 the third."""
-    block = regression(K=3, r=40)
-    block.rows[:, [0, 2]] = 0.0
+    rows = np.ones((4, 40, 4))
+    rows[:, [0, 2]] = 0.0
+    block = SampledRegression(np.arange(3.0), np.array([0.0, 1.0, 1.0]), rows, "zoh")
     _, taken, _ = _RowFilter(np.array([1.0, 2.0, 3.0])).seen(block)
     np.testing.assert_array_equal(taken, np.broadcast_to(np.eye(40)[[1, 3, 4]], taken.shape))
 
