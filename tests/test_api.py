@@ -313,6 +313,8 @@ def test_a_folder_of_ones_own(tmp_path):
     result = run("mine", estimator="fast", config_dir=tmp_path, time={"samples": 11})
     assert result.cases[0]["gamma"] == 1e12
     assert load_plant("mine", tmp_path).source.endswith("mine.yaml")
+    with pytest.raises(ConfigError, match=r"there is no such estimator; known: [\w, ]+$"):
+        run("mine", estimator="mystery", config_dir=tmp_path)  # who gives one is told of none
     (tmp_path / "plant" / "lab").mkdir()
     (tmp_path / "plant" / "lab" / "other.yaml").write_text(DECAYING)
     (tmp_path / "plant" / "loop").symlink_to(tmp_path / "plant")  # it is not followed

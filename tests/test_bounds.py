@@ -310,6 +310,9 @@ def test_a_pole_is_no_jump_and_may_stand_in_the_last_element():
     _refuse_poles(tape, np.array([1.5]), edges, alone)
     with refused("here = '1/(t - 1.5)' grows beyond all numbers near t = 1.5; choose a horizon"):
         _refuse_poles(tape, np.array([1.5]), edges, ~alone)
+    for text in ("step(t - 1.5)/(t - 1.5)", "step(1.5 - t)/(t - 1.5)"):  # of one side alone
+        with refused(f"here = '{text}' grows beyond all numbers near t = 1.5"):
+            _refuse_poles(record([parse(text, {}, "here")]), np.array([1.5]), edges, alone[:, :1])
 
 
 def test_nothing_is_looked_at_before_the_start():

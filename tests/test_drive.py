@@ -113,10 +113,9 @@ def test_mistakes_are_named(tmp_path, given, said):
 @pytest.mark.parametrize("others", [{}, {"phi": ["-y**3"]}])
 def test_an_experiment_stays_within_the_table(tmp_path, others):
     plant = {**PLANT, **others, "inputs": {"u": {"file": table(tmp_path)}}}
-    with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = 4;"):
-        run(plant, observer="none", time={"horizon": 4})
-    with pytest.raises(ConfigError, match=r"is of t = 0 to 3, and the experiment needs t = -1;"):
-        run(plant, observer="none", time={"start": -1, "horizon": 2})
+    for time, beyond in (({"horizon": 4}, 4), ({"start": -1, "horizon": 2}, -1)):
+        with pytest.raises(ConfigError, match=f"is of t = 0 to 3, .* needs t = {beyond};"):
+            run(plant, observer="none", time=time)
 
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])

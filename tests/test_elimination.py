@@ -145,6 +145,12 @@ def test_matrices_by_their_entries_are_what_full_ones_are(times):
         assert one.growth(own, 1e9) == pytest.approx(matrix.growth(np.ones(9), 1e9), rel=1e-12)
 
 
+def test_growth_of_many_states_is_looked_at_once_at_least(monkeypatch):
+    monkeypatch.setattr("gpebo_cli.numerics.taylor._LOOKED_AT", 1)  # times by states³
+    A = np.diag([0.5, -1.0, -2.0]) + np.diag([3.0, 0.0], 1)
+    assert by_entries(A[None]).growth(np.ones(3), 0.0) == pytest.approx(0.5)
+
+
 def test_full_matrices_are_not_solved_by_series_of_their_entries():
     def full(t, inside):
         return LinearEquation(None, -np.ones((len(t), D, D)), np.zeros((1, D, 1)))

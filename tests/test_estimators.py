@@ -396,6 +396,29 @@ def test_what_the_power_law_needs_is_told_by_the_last_quotient():
     assert found.evidence["needed"] == pytest.approx(2.0 * np.sqrt(2.0))
 
 
+def test_what_the_power_law_needs_counts_a_delta_below_zero():
+    """With rates of its own in each row Ω is not symmetric: here Δ changes its sign."""
+    def psi(t):
+        return np.stack([np.ones_like(t), 1.0 + 9.0 * np.exp(-t)], axis=-1)[..., None, :]
+
+    def delta(t):  # Ω_ij = λ_i ∫ e^{−λ_i(t − s)} ψ_i ψ_j ds, of powers of e^{−s}
+        def of(rate, *terms):
+            return rate * sum(
+                c * (np.exp(-k * t) - np.exp(-rate * t)) / (rate - k) for k, c in terms
+            )
+
+        two, square = ((0, 1), (1, 9)), ((0, 1), (1, 18), (2, 81))
+        return of(0.1, (0, 1)) * of(5.0, *square) - of(0.1, *two) * of(5.0, *two)
+
+    made = LinearRegression.from_functions(
+        psi, lambda t: psi(t) @ np.ones(2), ["p1", "p2"], 10.0, 40
+    )
+    found = estimate("power", made, **{"lambda": [0.1, 5.0]}).requirement.evidence
+    energy = quad(lambda t: abs(delta(t)) ** 1.5, 0.0, 10.0, limit=200)[0]
+    assert delta(T).min() < -0.1
+    assert found["integral_delta_squared"] == pytest.approx(energy, rel=1e-5)
+
+
 @pytest.mark.parametrize("size", [1e-70, 1e-77, 1e-81])
 def test_the_power_law_stands_still_where_nothing_is_left_of_the_regressor(size):
     """Δ is of size⁴, next to the smallest number, and the residual is zero."""

@@ -529,6 +529,7 @@ def test_a_value_that_is_not_finite_inside_an_interval() -> None:
     (np.cos, -1.0, 2.0, np.cos(2.0), 1.0), (np.tan, 1.0, 2.0, -np.inf, np.inf),
     (np.tan, -1.0, 1.0, np.tan(-1.0), np.tan(1.0)),
     (lambda x: x**2, -1.0, 2.0, 0.0, 4.0), (lambda x: x**3, -2.0, 1.0, -8.0, 1.0),
+    (lambda x: x**1, -2.0, 1.0, -2.0, 1.0),
     (lambda x: x**1026, -1.0, 0.5, 0.0, 1.0), (lambda x: x**1027, -1.0, 0.5, -1.0, 0.0),
     (lambda x: x**1.5, 1.0, 4.0, 1.0, 8.0), (lambda x: x**1.5, -2.0, -1.0, -np.inf, np.inf),
     (lambda x: x**1.5, -1.0, 4.0, 0.0, 8.0),

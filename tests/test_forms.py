@@ -951,6 +951,39 @@ def test_assumption_1_fails_at_the_time_that_is_named(size):
         observe(system, Measurements(u, y), form="given")
 
 
+def test_assumption_1_that_fails_along_a_signal_is_seen_between_its_times():
+    """0 = a + (u - 2.1) v along u = t: v is told at all times of the mesh."""
+    system = plant_from_mapping({
+        "name": "once", "states": ["a", "v"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
+        "inputs": {"u": "t"}, "B": [[0], [0]],
+        "A": [[-1, 1], [1, "u - 2.1"]], "C": [[1, 0]], "initial_state": [0, 0],
+    })
+    mesh = initial_mesh(0.0, 4.0, [], 8, radau_rule(5))
+    signals = Measurements(
+        Trajectory(mesh, mesh.points[..., None]), Trajectory(mesh, np.zeros((8, 6, 1)))
+    )
+    with pytest.raises(ModelError, match=r"Assumption 1 .* fails at t = 2\.1: "):
+        observe(system, signals, form="given")
+
+
+@pytest.mark.parametrize(("off", "gone"), [
+    ([0, 1, 1, 1, 0], [0, 1, 1, 1, 0]), ([1, 1, 0, 1, 1], [0] * 5), ([1] * 5, [1] * 5),
+    ([0, 1, 1, 1, 1], [0, 1, 1, 1, 1]),
+])
+def test_an_output_is_off_where_it_is_at_three_times_in_a_row(off, gone):
+    """Of y = c(t) x nothing is left in Y where c is zero for a while."""
+    system = plant_from_mapping({
+        "name": "off", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[-1]], "C": [["t"]],
+        "initial_state": [0],
+    })
+    t = np.where(off, 0.0, 1.0)
+    form = EquationForm.given(system)
+    found = observer_matrices(form, t, t, 1e-10)
+    for alone, zero in ((True, off), (False, gone)):
+        taken = found._measured(alone=alone)[:, -1, -1]
+        assert np.broadcast_to(taken == 0.0, 5).tolist() == list(map(bool, zero))
+
+
 def test_what_is_left_where_assumption_1_fails_is_left_at_all_times():
     """Of v and w one is told, but not at t = 2.1, which is met when elements are cut."""
     system = plant_from_mapping({

@@ -184,7 +184,7 @@ def test_entries_that_come_later_and_outputs_that_are_not_known_are_named():
         fed.coefficients.taylor(np.ones(1), 0)
     assert not fed.coefficients.of_time.taylor(np.ones(1), 0).A.any()
     known = {"A": -np.eye(2), "B": np.zeros((2, 1)), "u": lambda t: t[:, None]}
-    along = {**two, "C": lambda t, u: u[:, None] * [1.0, 0.0]}
+    along = {**two, "C": lambda t, u: np.stack([u[:, 0], 0.0 * t], axis=1)[:, None]}
     seen = system_from_functions("two", **known, **along)
     assert seen.coefficients.taylor(np.array([3.0]), 0).C.ravel().tolist() == [3.0, 0.0]
     with pytest.raises(TypeError, match="a mistake of one's own"):

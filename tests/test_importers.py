@@ -223,6 +223,15 @@ def test_the_index_is_what_topology_says(branches):
     assert ("no loop of capacitors" in topology) == (index < 2)
 
 
+def test_a_loop_of_many_capacitors_is_one():
+    """V = v1 + v2 + v3 of capacitors in a row: i_V is C of all in series times V'."""
+    text = "t\nV1 a 0 SIN(0 1 1)\nC1 a b 1\nC2 b c 2\nC3 c 0 2\nR1 b 0 1\nR2 c 0 1\n"
+    said = circuit_from_netlist(text, "c").comments[-1]
+    assert said == (
+        "index 2 by topology (loop of capacitors and voltage sources: V1, C1, C2, C3)"
+    )
+
+
 def test_names_that_are_there_twice():
     """Element, parameter and node of one name, and words of Python, stay apart."""
     same = "names\n.param r1=2 lambda={r1/2}\nv1 v1 0 1\nr1 v1 c1 {r1}\nc1 c1 0 {lambda}\n"
@@ -581,6 +590,8 @@ def test_mechanics_of_index_3():
     draft = from_mechanics(SLIDER_CRANK, "rod")
     assert draft.title == "mechanism rod"
     assert from_mechanics({**SLIDER_CRANK, "title": "a rod"}, "rod").title == "a rod"
+    book = from_mechanics({**SLIDER_CRANK, "reference": "a book"}, "rod", "rod.yaml")
+    assert book.mapping()["reference"] == "a book"
     result = simulated(draft.mapping())
     assert result.details.simulation.index == 3
 

@@ -445,6 +445,14 @@ def test_a_recording_has_its_own_sample_times_and_noise(level, samples):
     assert (told in result.verdict) == (level != "given")
 
 
+def test_a_recording_of_one_row_more_than_nothing_has_no_level_of_noise():
+    """A constant that one row, held up to the end, tells: there is nothing left to take it from."""
+    data = {"frame": pd.DataFrame({"t": [0.0, 1.0], "y": [1.0, 0.4]}), "hold": "zoh"}
+    found = api_run(one_state(initial_state=[0]), observer="kalman_bucy", data=data)
+    assert "noise of the outputs taken from" not in found.verdict
+    assert found["x_hat"][0, -1] == pytest.approx(1.0, abs=1e-5)
+
+
 def test_a_recording_that_is_fitted_exactly_has_no_level_of_noise():
     """Two rows, and three states to fit them with."""
     plant = {

@@ -14,7 +14,7 @@ import pytest
 from kernel_paths import needs_kernels
 
 from gpebo_cli import kernels
-from gpebo_cli.kernels import laws_numpy, structure_numpy
+from gpebo_cli.kernels import laws_numpy, signals_numpy, structure_numpy
 from gpebo_cli.numerics.elimination import steps_of
 from gpebo_cli.numerics.linalg import affine_scan
 from gpebo_cli.numerics.radau import radau_rule
@@ -508,6 +508,26 @@ def test_what_is_rounding_is_regularised_with_pivots():
     (_, one, _), (_, other, _) = both_kinds_answer("laws", "mixed", extended, 0.0 * added)
     np.testing.assert_array_equal(one[4:6], other[4:6])
     assert not other[4:6, :3].any()
+
+
+def test_least_squares_of_less_than_everything_is_the_shortest():
+    """x + y = 2 alone; and zero of zeros."""
+    extended = np.zeros((2, 2, 3))
+    extended[0] = [[1.0, 1.0, 2.0], [1.0, 1.0, 2.0]]
+    found = laws_numpy.regularised(extended, np.zeros(2))
+    np.testing.assert_allclose(found[..., 0], [[1.0, 1.0], [0.0, 0.0]], atol=1e-14)
+
+
+def test_what_is_left_out_counts_beside_the_floor():
+    """Of 1e-9 P_3 beside a floor of 1e-3 that is 1e-6 to the power of 4/3; of zeros nothing."""
+    rule = radau_rule(3)
+    x = 2.0 * rule.points - 1.0
+    cubic = 1e-9 * 0.5 * (5.0 * x**3 - 3.0 * x)
+    for values, floor, left in ((cubic, 1e-3, 1e-6), (cubic, 0.0, 1.0), (0.0 * cubic, 0.0, 0.0)):
+        found = signals_numpy.tails(
+            values[None, :, None], rule.to_legendre, 1, 0.0, 0.0, floor, None
+        )
+        assert found == pytest.approx(left ** (4 / 3), rel=1e-6)
 
 
 @needs_kernels

@@ -345,6 +345,7 @@ def compare(panels: list[Panel], reference: list[Panel], folder: Path) -> list[s
 def test_a_reference_goes_from_the_first_time_to_the_last() -> None:
     rows = reference_text(decaying(1.0)).splitlines()[1:]
     assert [float(row.split(",")[0]) for row in rows] == pytest.approx(np.arange(0.0, 20.1, 0.5))
+    assert rows[1].split(",") == ["0.5", "0.6065306597"]  # e^(-1/2) in 10 digits
 
 
 def test_a_difference_says_which_curve_where_and_by_how_much(tmp_path: Path) -> None:

@@ -670,6 +670,10 @@ def test_what_is_wrong_with_a_data_frame(change, part):
         read("", frame=frame)
     with refused("has 1 rows; at least 2 are needed"):
         read("", frame=pd.DataFrame(good).iloc[:1])
+    dates = ["2024-01-01", "2024-01-02", "2024-01-03"]
+    with refused("column V: object is not numbers"):  # whatever the times are
+        read("", frame=pd.DataFrame({"t": dates, "V": pd.Series(dates, dtype=object),
+                                     "y": [3.0, 5.0, 6.0]}), time_unit="datetime")
     with refused("row 1, column t: nan"):  # whatever is done about gaps of signals
         read("", frame=pd.DataFrame(good | {"t": [0.0, np.nan, 1.0]}), missing="hold")
     with refused("row 0, column V: inf is no number") as told:  # and no gap
@@ -982,11 +986,10 @@ def test_a_look_at_a_table_with_types(tmp_path):
     savemat(path, {"t": t, "fs": 1e3, "long": np.zeros(9), "volt in kV": both, "y": [1, 2, 3]})
     found = guess(str(path), shipped("circuit"))
     assert found.columns == {"t": "t", "y": "y"}
-    savemat(path, {"t": t, "V": both, "y": [[1], [2], [3]], "long": np.zeros(9)})
-    found = guess(str(path), shipped("circuit"))
-    assert (found.columns, found.missing) == ({"t": "t", "V": "V_1", "y": "y"}, 1)
-    savemat(path, {"t": t, "V": both.T, "y": t, "long": np.zeros(9)})  # signals are rows
-    assert guess(str(path), shipped("circuit")).columns == {"t": "t", "V": "V_1", "y": "y"}
+    for matrix in (both, both.T):  # a column or a row for each signal
+        savemat(path, {"t": t, "V": matrix, "y": [[1], [2], [3]], "long": np.zeros(9)})
+        found = guess(str(path), shipped("circuit"))
+        assert (found.columns, found.missing) == ({"t": "t", "V": "V_1", "y": "y"}, 1)
     savemat(path, {"V": 9.0 - t, "y": t**2})
     assert {*guess(str(path), shipped("circuit")).columns.values()} <= {"V", "y"}  # that are there
     savemat(path, {"all": {"t": t, "V": t, "y": t}})
@@ -1002,6 +1005,7 @@ def test_signals_that_are_not_found_are_said(tmp_path):
     assert any("no column was found for V" in doubt for doubt in found.doubts)
     for content, message in (
         (b"t,V,y\n0,1,\xff\n", "lab.csv, line 2: not UTF-8 text"),
+        (b"\n\xff,V,y\n0,1,2\n", "lab.csv, line 2: not UTF-8 text"),
         (b"t,V,y\n", "lab.csv has no rows below its header"),
         (b"t\n0\n1\n", "lab.csv: no character of comma, semicolon, tab and space cuts its first"),
         (b"t,V\n0,1,2\n", "lab.csv: no character of comma, semicolon, tab and space cuts its f"),
@@ -1020,7 +1024,7 @@ def test_signals_that_are_not_found_are_said(tmp_path):
 ])
 def test_lines_above_the_header_are_told_by_the_number_of_the_header(tmp_path, above, told):
     path = tmp_path / "lab.csv"
-    path.write_text(above + ("0,1,2\n" if "?" in told else "t,V,y\n0,1,2\n1,2,3\n"))
+    path.write_text(above + ("0,1,2\n" if "?" in told else "t,V,y\n0,1,2\n"))  # one row
     with refused(f"the same number of cells, two at least; {told}"):
         guess(str(path), shipped("circuit"))
 

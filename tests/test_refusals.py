@@ -204,8 +204,13 @@ CIRCUIT = "* divider\nV1 a 0 1\nR1 a b 1\nC1 b 0 1\n.end\n"
            {"experiment/x.yaml": f"# @package _global_\ndefaults: [{entry}]\ntitle: a\n"},
            "a defaults list may choose a file of plant, ")
           for entry in ("/docs/extra", "/docs: extra", "/experiment: ../docs/extra")),
-        *((["run", "experiment=x"], {"experiment/x.yaml": text}, f"x.yaml: {key}: expected a")
-          for key, text in (("plant", "plant: circuit\n"), ("time", "time: [1]\n"))),
+        *((["run", "experiment=x"], {"experiment/x.yaml": text},
+           f"x.yaml: {key}: expected a mapping of keys to values, got {rest}\n")
+          for key, text, rest in (
+              ("plant", "plant: circuit\n",
+               "'circuit'; files are chosen as in `- override /plant: NAME`"),
+              ("time", "time: [1]\n", "[1]"),
+          )),
         (["run", "experiment=x"], {"experiment/x.yaml": "# @package plant\ntime: {horizon: 1}\n"},
          "x.yaml: only `# @package _global_` is allowed, got 'plant'"),
         (["run", "experiment=x"], {"experiment/x.yaml":

@@ -323,12 +323,14 @@ def test_terms_of_an_expression_are_the_largest_that_it_adds_up():
     u, w = signal("u", 0, "a signal"), signal("w", 1, "a signal")
     tape = record([
         parse(text, {"u": u, "w": w}, "x")
-        for text in ("u - w", "w - u + 1e-3", "-u*w", "(u - w)/(u + w)", "cos(u)", "2*u - u - u")
+        for text in ("u - w", "w - u + 1e-3", "-u*w", "(u - w)/(u + w)", "cos(u)", "2*u - u - u",
+                     "u/w + 1e-3")
     ])
     t, values = np.array([0.0, 1.0]), np.array([[3.0, -1.0], [0.5, 0.25]])
     found = tape.terms(t, values, 2.0 * np.abs(values))
     np.testing.assert_allclose(found, [
-        [6.0, 6.0, 12.0, 3.0, -np.cos(3.0), 12.0], [1.0, 1.0, 0.5, 1.0 / 0.75, np.cos(0.5), 2.0],
+        [6.0, 6.0, 12.0, 3.0, -np.cos(3.0), 12.0, 6.0],
+        [1.0, 1.0, 0.5, 1.0 / 0.75, np.cos(0.5), 2.0, 4.0],
     ])
 
 

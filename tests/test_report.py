@@ -192,6 +192,9 @@ def test_errors_over_seeds_are_told_by_case_and_parameter(tmp_path):
     assert set(table["seeds"]) == {7}
     few = replace(noise, bias=bias[:4])
     assert len(noise_table(few)) == 13
+    many = replace(noise, names=[f"p{k}" for k in range(13)], bias=np.ones((2, 13)),
+                   deviation=np.ones((2, 13)), rms=np.ones((2, 13)))
+    assert len(noise_table(many)) == 1 + 13 + 1  # one case at least, and no more
 
 
 @pytest.fixture(scope="module")

@@ -482,6 +482,17 @@ def test_a_frame_has_all_directions_in_any_unit(size, unit):
     assert 1e-3 <= np.linalg.norm(frame.basis, axis=0).max() / unit <= 4.0
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e4])
+def test_an_element_of_a_covariance_is_the_same_in_any_unit(unit):
+    """P' = 1 - P² from tanh(1/2) is tanh(t + 1/2), and ζ' = -P ζ is 1/cosh of that."""
+    rule = radau_rule(14)
+    H = np.broadcast_to([[0.0, unit**-2.0], [unit**2, 0.0]], (14, 2, 2))
+    left, estimate = np.full((1, 1), unit**2 * np.tanh(0.5)), np.full((1, 1), unit / np.cosh(0.5))
+    P, found = _stiff_riccati._element(rule, 1.0, H, np.zeros((14, 2, 1)), left, estimate)
+    np.testing.assert_allclose(P.ravel(), unit**2 * np.tanh(rule.nodes + 0.5), rtol=1e-9)
+    np.testing.assert_allclose(found.ravel(), unit / np.cosh(rule.nodes + 0.5), rtol=1e-9)
+
+
 @pytest.mark.parametrize(("elements", "longest"), [
     (1, np.inf), (20, np.inf), (20, 0.05), (20, 0.0),
 ])
@@ -502,11 +513,12 @@ def test_a_filter_that_is_very_fast_follows_on_few_elements(elements, longest, m
     def model(t, inside):
         one = np.ones((1, 1, 1))
         z = 1.0 + 0.0 * t[:, None, None]
-        return StateSpace(a * one, 0.5 * one, one, z, q * one, 0.0 * one, V * one), ()
+        return StateSpace(a * one, 0.5 * one, one, z, q * one, 0.0 * one, V * one), (z,)
 
     mesh = initial_mesh(0.0, 2.0, [], elements, radau_rule(14))
     found = run_filter(
-        model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-9, max_elements=1000
+        model, np.zeros((1, 1)), np.ones((1, 1)), mesh, tol=1e-9, max_elements=1000,
+        monitor=lambda estimate, extras: [((estimate * extras[0])[..., 0], 0.0)],
     )
     fast = np.sqrt(a * a + q / V)
     upper, lower = V * (a + fast), V * (a - fast)

@@ -31,6 +31,7 @@ from gpebo_cli.estimators._recursive import (
     quotient_of,
     spectrum,
 )
+from gpebo_cli.estimators.lion import _RowFilter
 from gpebo_cli.experiment.online import Online
 from gpebo_cli.experiment.pipeline import run_experiment, stream
 from gpebo_cli.model.plant import plant_from_mapping
@@ -715,7 +716,7 @@ def test_what_the_last_sample_determines_is_told():
 
 def test_the_power_law_at_samples_needs_what_its_start_is_off():
     """|e|^½ falls by γ/2 ∫|Δ|^{3/2}, and with twice the needed γ e is zero at the end."""
-    block, eta = regression(K=25), np.array([1.0, -2.0, 2.0])
+    block, eta = regression(K=25), np.array([1.0, -2.0, 1.5])
     block.rows[..., 3] = block.rows[..., :3] @ eta
     omega = KreisselmeierFilter(np.ones(3)).update(block)[..., :3]
     known = np.linalg.cond(omega) < 1e12
@@ -733,6 +734,15 @@ def test_the_power_law_at_samples_needs_what_its_start_is_off():
             "integral_delta_squared": energy[-1], "gamma_times_integral": share * needed,
             "needed": needed,
         })
+
+
+def test_filters_take_rows_in_turn_however_many_there_are():
+    """Row i of the extension is row i mod r of the r that are not zero so far: of 40 the third."""
+    rows = np.ones((4, 40, 4))
+    rows[:, [0, 2]] = 0.0
+    block = SampledRegression(np.arange(3.0), np.array([0.0, 1.0, 1.0]), rows, "zoh")
+    _, taken, _ = _RowFilter(np.array([1.0, 2.0, 3.0])).seen(block)
+    np.testing.assert_array_equal(taken, np.broadcast_to(np.eye(40)[[1, 3, 4]], taken.shape))
 
 
 def test_the_level_that_is_asked_for_is_reached_at_a_sample():

@@ -545,6 +545,7 @@ def test_a_curve_does_not_join_runs_that_differ_in_what_they_do_not_tell():
     (first, *_) = metric_panels([*quiet, case("noisy", 10.0, 1e-2)], "gamma")
     assert [(curve.label, curve.y.tolist()) for curve in first.curves] == [("quiet", [1e-9] * 3)]
     assert first.curves[0].x.tolist() == [1.0, 10.0, 100.0]
+    assert first.curves[0].style.dots  # where runs are
     again = replace(quiet[0], run="again/1", chosen={"gamma": 10.0, "plant": "p"})
     (first, *_) = metric_panels([*quiet, again], "gamma")
     assert [curve.label for curve in first.curves] == ["quiet"]  # one run's own curve
@@ -620,6 +621,7 @@ def test_colours_of_a_map_are_logarithmic_over_more_than_a_decade(values, told):
     figure = _heat_map(x, x, np.array(values, float), ("gamma", "f0", "rms_error_states"), "drem")
     assert [tick.get_text() for tick in figure.axes[1].get_yticklabels()] == told
     assert "drem" in figure.axes[0].get_title(loc="left")  # which runs they are
+    assert (figure.axes[0].get_xlabel(), figure.axes[0].get_ylabel()) == ("γ", "f₀")
     (image,), low, high = figure.axes[0].images, np.min(values), np.max(values)
     middle = np.sqrt(low * high) if high == 1000 else (low + high) / 2
     assert image.norm(middle) == pytest.approx(0.5)

@@ -203,7 +203,7 @@ def series(
                 left = left if len(terms) > f.shape[1] else np.inf
             if not left <= tol:
                 changes[k], terms = np.inf, [np.zeros((d, columns))]
-            here = (nodes * count > i) & ((nodes * count <= i + 1) | (i + 1 == count))
+            here = (nodes * count > i) & (nodes * count <= i + 1)
             powers = (nodes[here, None] * count - i) ** np.arange(len(terms))
             values[k, 1:][here] = np.tensordot(powers, np.array(terms), axes=1)
             state, part = np.sum(terms, axis=0), part + 1

@@ -209,7 +209,7 @@ def _heat_map(
             interpolation="nearest",
         )
         for axis, numbers, name in ((axes.xaxis, x, across), (axes.yaxis, y, up)):
-            places = np.unique(np.linspace(0, len(numbers) - 1, min(len(numbers), 5)).astype(int))
+            places = np.linspace(0, len(numbers) - 1, min(len(numbers), 5)).astype(int)
             axis.set_ticks(places, [number_text(float(numbers[p])) for p in places])
             axis.set_label_text(symbol(name))
         bar = figure.colorbar(image, ax=axes, pad=0.02)
