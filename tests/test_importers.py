@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import zipfile
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,6 +35,7 @@ from gpebo_cli.importers.circuit import circuit_from_netlist
 from gpebo_cli.importers.matrices import _identifiers
 from gpebo_cli.importers.mechanics import linearise
 from gpebo_cli.importers.netlist import number, read_netlist
+from gpebo_cli.model.archive import read_mat
 from gpebo_cli.model.expressions.syntax import parse
 from gpebo_cli.model.plant import plant_from_mapping
 
@@ -1088,6 +1090,52 @@ def test_an_array_beside_the_same_matrix_of_an_archive_is_refused(tmp_path):
     plant = one_state(A=np.eye(2), matrices="m.npz")
     with refused("A stands in the plant and in"):
         plant_from_mapping(plant, str(tmp_path / "p.yaml"))
+
+
+MATLAB = {
+    "t": np.arange(3.0), "i": np.array([[1, -2]], dtype=np.int8), "z": np.array([[1j], [2.0]]),
+    "n": np.array([[2**60 + 1]]), "f": np.float32(0.1), "S": sparse.csc_array([[0, 2.0], [0, 1]]),
+    "Z": sparse.csc_array([[0, 1j]]), "no": np.zeros((0, 2)), "yes": np.array([True, False]),
+    "cube": np.arange(24.0).reshape(2, 3, 4),
+}
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_numbers_of_a_matlab_file(tmp_path, packed):
+    savemat(tmp_path / "a.mat", MATLAB | {"text": "t", "cell": np.array([1, "a"], dtype=object)},
+            do_compression=packed)
+    found = read_mat(str(tmp_path / "a.mat"))
+    assert [*found] == [*MATLAB]
+    for name, saved in MATLAB.items():
+        one, other = (x.toarray() if sparse.issparse(x) else np.asarray(x)
+                      for x in (found[name], saved))
+        assert one.dtype == other.dtype or name == "yes"
+        np.testing.assert_array_equal(one, np.atleast_2d(other))
+    assert [*read_mat(str(tmp_path / "a.mat"), ["S", "other"])] == ["S"]
+
+
+def test_numbers_of_a_matlab_file_from_a_big_endian_machine(tmp_path):
+    parts = struct.pack(">IIII", 6, 8, 6, 0), struct.pack(">IIii", 5, 8, 2, 1)
+    body = b"".join(parts) + b"\0\1\0\1x\0\0\0" + struct.pack(">IIdd", 9, 16, 1.5, -2.0)
+    content = b" " * 124 + b"\1\0MI" + struct.pack(">II", 14, len(body)) + body
+    (tmp_path / "a.mat").write_bytes(content)
+    np.testing.assert_array_equal(read_mat(str(tmp_path / "a.mat"))["x"], [[1.5], [-2.0]])
+
+
+def test_a_damaged_matlab_file_is_refused_or_read(tmp_path):
+    """SciPy's reader ends the process where a type, a flag or a length is another one."""
+    path = tmp_path / "a.mat"
+    savemat(path, {"z": [1j], "S": sparse.eye_array(2), "text": "t"})
+    whole = path.read_bytes()
+    for at in range(124, len(whole)):
+        for byte in (0x0F, whole[at] ^ 8):
+            path.write_bytes(whole[:at] + bytes([byte]) + whole[at + 1 :])
+            with suppress(ConfigError):
+                read_mat(str(path))
+    real = whole.index(struct.pack("<II", 9, 8))
+    path.write_bytes(whole[:real] + b"\x19" + whole[real + 1 :])
+    with refused("a.mat cannot be read ('no number has the type 25'); save it with -v7"):
+        read_mat(str(path))
 
 
 def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):

@@ -9,10 +9,9 @@ import io
 import math
 import os
 import struct
-import warnings
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from operator import index
 from typing import Any
 
@@ -30,7 +29,11 @@ MAX_BYTES = 200_000_000
 """Largest size of a file of matrices, unpacked."""
 
 _MAX_PACKED = 20_000_000  # a longer list of contents takes memory before anything can be counted
-_COMPRESSED = 15
+_SPARSE, _MATRIX, _COMPRESSED = 5, 14, 15  # a class of matrices, and types of elements
+_OF_NUMBERS = range(_SPARSE, 16)  # classes of matrices
+_DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8",
+           12: "i8", 13: "u8"}
+_ORDERS = {b"\0\1IM": "<", b"\1\0MI": ">"}  # heads of version 5 to 7
 _NUMBERS = ("double", "single", "sparse", "logical",
             *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 _PARTS = ("row", "col", "data", "shape")
@@ -96,18 +99,24 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
 
     with open_regular(path) as stream:
         content = stream.read(MAX_BYTES + 1)
-    if _unpacked(content) > MAX_BYTES:
-        raise ConfigError(f"{path} has more than {MAX_BYTES} bytes, or unpacks to more")
     try:
-        # The head of a cell array may claim any size, and memory is taken for it at once.
+        if order := _ORDERS.get(content[124:128]):
+            content = content[:128] + _unpacked(content, order)
+        if len(content) > MAX_BYTES:
+            raise ConfigError(  # noqa: TRY301
+                f"{path} has more than {MAX_BYTES} bytes, or unpacks to more"
+            )
+        if order:
+            return _matrices(content[128:], order, names)
         numbers = [
             name for name, _, kind in whosmat(io.BytesIO(content))  # type: ignore[arg-type]
             if kind in _NUMBERS and (names is None or name in names)
         ]
-        with warnings.catch_warnings(action="ignore"):  # any of SciPy's two kinds of sparse
-            found: dict[str, Any] = loadmat(
-                io.BytesIO(content), variable_names=numbers  # type: ignore[arg-type]
-            )
+        found: dict[str, Any] = loadmat(
+            io.BytesIO(content), variable_names=numbers  # type: ignore[arg-type]
+        )
+    except ConfigError:
+        raise
     except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever a library says of them
         raise ConfigError(
             f"{path} cannot be read ({shown(str(error))}); save it with -v7"
@@ -115,25 +124,65 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
     return {name: found[name] for name in numbers}
 
 
-def _unpacked(content: bytes) -> int:
-    """Bytes of a MATLAB file when its compressed elements (of type 15) are unpacked, or too many.
+def _unpacked(content: bytes, order: str) -> bytes:
+    """What follows the head of a MATLAB file, without compression, or the start of too much."""
+    found = bytearray()
+    for kind, data in _elements(content[128:], order):
+        if kind == _COMPRESSED:
+            unpacker = zlib.decompressobj()
+            found += unpacker.decompress(data, max(MAX_BYTES - len(found), 0) + 1)
+            if not unpacker.eof and len(found) <= MAX_BYTES:
+                raise ValueError("compressed data end too soon")
+        else:
+            found += struct.pack(f"{order}II", kind, len(data)) + data + bytes(-len(data) % 8)
+    return bytes(found)
 
-    What is no such file counts as it stands; its reader says better what it is.
+
+def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """Types and data of what stands one behind the other in a MATLAB file, or in a matrix of it."""
+    at = 0
+    while at + 8 <= len(content):
+        kind, length = struct.unpack_from(f"{order}II", content, at)
+        start, kind, length = (at + 4, kind & 0xFFFF, kind >> 16) if kind >> 16 else (
+            at + 8, kind, length  # the others are of at most four bytes, within the tag
+        )
+        yield kind, content[start : start + length]
+        at = start + length + (0 if kind == _COMPRESSED else -(start + length - at) % 8)
+
+
+def _matrices(content: bytes, order: str, names: Sequence[str] | None) -> dict[str, Any]:
+    """The arrays of numbers among the elements; SciPy's reader may crash where one is damaged.
+
+    ValueError: one is.
     """
-    size, at = len(content), 128
-    tag = struct.Struct("<II" if content[126:128] == b"IM" else ">II")
-    while size <= MAX_BYTES and at + tag.size <= len(content):
-        kind, length = tag.unpack_from(content, at)
-        at += tag.size
-        packed, unpacker = content[at : at + length], zlib.decompressobj()
-        at += length
-        while kind == _COMPRESSED and packed and size <= MAX_BYTES:
-            try:
-                size += len(unpacker.decompress(packed, 1 << 20))
-            except zlib.error:
-                break
-            packed = unpacker.unconsumed_tail
-    return size
+    from scipy.sparse import csc_array
+
+    def vector(kind: int, data: bytes) -> Any:
+        if kind not in _DTYPES:
+            raise ValueError(f"no number has the type {kind}")
+        return np.frombuffer(data, f"{order}{_DTYPES[kind]}").astype(_DTYPES[kind])
+
+    found: dict[str, Any] = {}
+    for kind, matrix in _elements(content, order):
+        if kind != _MATRIX:
+            continue
+        flags, shape, (_, label), *data = *_elements(matrix, order), *[(0, b"")] * 7
+        told = int.from_bytes(flags[1][:4], "little" if order == "<" else "big")
+        name, class_ = label.decode(), told & 0xFF
+        if not name or class_ not in _OF_NUMBERS or (names is not None and name not in names):
+            continue
+        where = [vector(*part) for part in data[:2]] if class_ == _SPARSE else []
+        real, imaginary, *_ = data[len(where) :]
+        if where and [len(real[1])] == where[1][-1:].tolist():
+            real = 2, real[1]  # truth values, which MATLAB may call doubles
+        values = vector(*real) + (1j * vector(*imaginary) if told & 0x800 else 0)
+        size = vector(*shape)
+        if where:
+            found[name] = csc_array((values, *where), shape=tuple(size.tolist()))
+            found[name].check_format(full_check=True)
+        else:
+            found[name] = values.reshape(np.maximum(size, 0), order="F")
+    return found
 
 
 def _sparse(arrays: Mapping[str, Any], matrix: str, path: str) -> Any:
