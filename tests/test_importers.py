@@ -1136,6 +1136,9 @@ def test_a_damaged_matlab_file_is_refused_or_read(tmp_path):
     path.write_bytes(whole[:real] + b"\x19" + whole[real + 1 :])
     with refused("a.mat cannot be read ('no number has the type 25'); save it with -v7"):
         read_mat(str(path))
+    path.write_bytes(whole[:124] + b"\0\2" + whole[126:])  # as -v7.3 begins
+    with refused("a.mat cannot be read ('it is of no version up to 7'); save it with -v7"):
+        read_mat(str(path))
 
 
 def test_files_that_claim_or_unpack_to_too_much(tmp_path, monkeypatch):

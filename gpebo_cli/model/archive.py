@@ -12,6 +12,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
 from operator import index
 from typing import Any
 
@@ -100,14 +101,16 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
     with open_regular(path) as stream:
         content = stream.read(MAX_BYTES + 1)
     try:
-        if order := _ORDERS.get(content[124:128]):
-            content = content[:128] + _unpacked(content, order)
-        if len(content) > MAX_BYTES:
+        order = _ORDERS.get(content[124:128])
+        whole = _unpacked(memoryview(content)[128:], order) if order else content
+        if max(len(content), len(whole)) > MAX_BYTES:
             raise ConfigError(  # noqa: TRY301
                 f"{path} has more than {MAX_BYTES} bytes, or unpacks to more"
             )
         if order:
-            return _matrices(content[128:], order, names)
+            return _matrices(memoryview(whole), order, names)
+        if 0 not in content[:4]:  # as in no text in front of another version
+            raise ValueError("it is of no version up to 7")  # noqa: TRY301
         numbers = [
             name for name, _, kind in whosmat(io.BytesIO(content))  # type: ignore[arg-type]
             if kind in _NUMBERS and (names is None or name in names)
@@ -124,21 +127,25 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
     return {name: found[name] for name in numbers}
 
 
-def _unpacked(content: bytes, order: str) -> bytes:
+def _unpacked(content: memoryview, order: str) -> bytearray:
     """What follows the head of a MATLAB file, without compression, or the start of too much."""
     found = bytearray()
-    for kind, data in _elements(content[128:], order):
+    for kind, data in _elements(content, order):
         if kind == _COMPRESSED:
             unpacker = zlib.decompressobj()
             found += unpacker.decompress(data, max(MAX_BYTES - len(found), 0) + 1)
             if not unpacker.eof and len(found) <= MAX_BYTES:
                 raise ValueError("compressed data end too soon")
+        elif kind != _MATRIX:
+            raise ValueError(f"no matrix has the type {kind}")
         else:
-            found += struct.pack(f"{order}II", kind, len(data)) + data + bytes(-len(data) % 8)
-    return bytes(found)
+            found += struct.pack(f"{order}II", kind, len(data))
+            found += data
+            found += bytes(-len(data) % 8)
+    return found
 
 
-def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+def _elements(content: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
     """Types and data of what stands one behind the other in a MATLAB file, or in a matrix of it."""
     at = 0
     while at + 8 <= len(content):
@@ -150,14 +157,14 @@ def _elements(content: bytes, order: str) -> Iterator[tuple[int, bytes]]:
         at = start + length + (0 if kind == _COMPRESSED else -(start + length - at) % 8)
 
 
-def _matrices(content: bytes, order: str, names: Sequence[str] | None) -> dict[str, Any]:
+def _matrices(content: memoryview, order: str, names: Sequence[str] | None) -> dict[str, Any]:
     """The arrays of numbers among the elements; SciPy's reader may crash where one is damaged.
 
     ValueError: one is.
     """
     from scipy.sparse import csc_array
 
-    def vector(kind: int, data: bytes) -> Any:
+    def vector(kind: int, data: memoryview) -> Any:
         if kind not in _DTYPES:
             raise ValueError(f"no number has the type {kind}")
         return np.frombuffer(data, f"{order}{_DTYPES[kind]}").astype(_DTYPES[kind])
@@ -165,10 +172,11 @@ def _matrices(content: bytes, order: str, names: Sequence[str] | None) -> dict[s
     found: dict[str, Any] = {}
     for kind, matrix in _elements(content, order):
         if kind != _MATRIX:
-            continue
-        flags, shape, (_, label), *data = *_elements(matrix, order), *[(0, b"")] * 7
+            raise ValueError(f"no matrix has the type {kind}")
+        parts = islice(_elements(matrix, order), 8)  # a cell may have millions
+        flags, shape, (_, label), *data = *parts, *[(0, memoryview(b""))] * 7
         told = int.from_bytes(flags[1][:4], "little" if order == "<" else "big")
-        name, class_ = label.decode(), told & 0xFF
+        name, class_ = bytes(label).decode(), told & 0xFF
         if not name or class_ not in _OF_NUMBERS or (names is not None and name not in names):
             continue
         where = [vector(*part) for part in data[:2]] if class_ == _SPARSE else []
