@@ -189,7 +189,7 @@ class InformationAt:
         return found
 
     def some(self, chosen: BoolArray | slice) -> InformationAt:
-        """The same at some of the times."""
+        """The same at some of the times, chosen (M,) or as a slice."""
         units = None if self.units is None else self.units[chosen]
         return InformationAt(self.values[chosen], self.memory[chosen], units)
 
