@@ -9,6 +9,7 @@ import io
 import math
 import os
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -115,9 +116,10 @@ def read_mat(path: str, names: Sequence[str] | None = None) -> dict[str, Any]:
             name for name, _, kind in whosmat(io.BytesIO(content))  # type: ignore[arg-type]
             if kind in _NUMBERS and (names is None or name in names)
         ]
-        found: dict[str, Any] = loadmat(
-            io.BytesIO(content), variable_names=numbers  # type: ignore[arg-type]
-        )
+        with warnings.catch_warnings(action="ignore"):  # any of SciPy's two kinds of sparse
+            found: dict[str, Any] = loadmat(
+                io.BytesIO(content), variable_names=numbers  # type: ignore[arg-type]
+            )
     except ConfigError:
         raise
     except Exception as error:  # noqa: BLE001  a stranger's bytes: whatever a library says of them
