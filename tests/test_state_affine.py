@@ -531,6 +531,8 @@ def test_iterates_go_on_as_long_as_they_will_do(share, most):
     ([2e-2, 1e-4, 1e-7], 2.0, 1e-12),  # ten squares of each make the next: ten of 1e-14
     ([1e-3, 1e-7], 1 + 2 / 3, 1e-13),  # it fell faster: one square
     ([1e-3, 1e-5, 0.0], 2 + 2 / 3, 0.0),
+    ([1e-13, 1e-7, 0.0], 2 + 2 / 3, 0.0),  # that of four digits is wrong by the 1e-7
+    ([2e-13, 2e-11, 5e-12, 4.9e-12], 3 + 2 / 3, 4.9e-12),  # it stays: rounding, which is told
 ])  # fmt: skip
 def test_the_change_of_one_more_iterate_is_expected_from_those_before(changes, work, expected):
     """Ten times what their squares say; up to a change of 1e-2 they have four digits of twelve."""

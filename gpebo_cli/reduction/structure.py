@@ -351,7 +351,8 @@ def _judged(t: Array, c: Coefficients, scaling: Scaling, rank_tol: float) -> _Le
             f"the rank of the derivative array changes from {first} at t = {times[0]:.6g} to "
             f"{then} at t = {times[k]:.6g} (singular value {value[min(k, len(value) - 1)]:.1e})"
         ))
-    bounds[which] = exact
+    # Beside a bound, the singular value itself would make dips of all the times around it.
+    bounds[~plain] = exact[~plain[which]]
     if failure := _why_not(t[which], exact, rank_tol):
         return _Levels(a, bounds, failure)
     return _Levels(a, bounds, "", reference, float(exact.min()), finite)

@@ -30,6 +30,7 @@ _FAST = 6  # iterates: a window that needs no more may be followed by a longer o
 _LOOSE = 1e-4  # tolerance of iterates that are far from the solution
 _NEAR = 1e-2  # change from which on iterates are worth the full tolerance
 _FEW_ELEMENTS, _MORE_ELEMENTS = 1_000, 8  # of late iterates: so many, or times those before
+_ROUNDED = 100.0  # tolerances: a change of fewer that does not shrink is rounding, but past jumps
 _SHRINKS = 0.5  # changes that do not fall to this share do not converge
 _MOST_GROWTH = 12.0  # of the logarithm of a small error within one window
 _SHORTEST = 1e-8  # of the horizon; where shorter windows are needed the solution ends
@@ -176,13 +177,17 @@ def _window(
         # Each change is about the square of the one before times a constant.
         growth = max(1.0, change / before / before) if 0.0 < before < np.inf else np.inf
         expected = min(change, _SAFETY * growth * change * change)
-        if full and expected <= solver.tol:
-            return found, count, work, expected
         share = _SHRINKS
         if count >= _TOLD:
             left = solver.tol / max(change, solver.tol)
             share = min(share, left ** (1.0 / (_MOST_ITERATES - count + 1)))
-        if not np.isfinite(change) or (count > 2 and change > share * before):
+        # Loose iterates that agree to the full tolerance say nothing of its first change.
+        agreed = full != was_full and before <= solver.tol
+        stands = count > 2 and change > share * before and not agreed
+        rounded = stands and change <= _ROUNDED * solver.tol and not len(passed)
+        if full and (rounded or expected <= solver.tol):
+            return found, count, work, expected
+        if stands or not np.isfinite(change):
             break
         guess, before, was_full = found, change, full
     said = (
