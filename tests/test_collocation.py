@@ -387,6 +387,15 @@ def test_rounding_of_times_moves_what_varies_by_their_size():
     assert truth < noise_of(t[-1:], t[None], swing)[0, 0, 0] < 2 * truth
 
 
+def test_rounding_of_an_equation_reaches_states_by_sizes_of_the_inverse_of_E():
+    """E⁻¹ = [1 −1; −1 2] has both signs: what reaches a state from two equations adds up."""
+    t, rng = np.linspace(0.0, 1.0, 9), np.random.default_rng(3)
+    A, f = rng.normal(size=(9, 2, 2)), rng.normal(size=(9, 2, 1))
+    E = np.array([[[2.0, 1.0], [1.0, 1.0]]])
+    plain, found = (noise_of(t[-1:], t[None], LinearEquation(e, A, f)) for e in (None, E))
+    np.testing.assert_allclose(found, np.array([[1.0, 1.0], [1.0, 2.0]]) @ plain, rtol=1e-13)
+
+
 @pytest.mark.parametrize("rate", [1e4, 1e8])
 def test_a_fast_mode_forgets_rounding_within_its_time(rate):
     """In an element of length h all but 1/(λ h); what is the same at all nodes is not averaged."""

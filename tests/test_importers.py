@@ -1136,6 +1136,10 @@ def test_a_damaged_matlab_file_is_refused_or_read(tmp_path):
     path.write_bytes(whole[:real] + b"\x19" + whole[real + 1 :])
     with refused("a.mat cannot be read ('no number has the type 25'); save it with -v7"):
         read_mat(str(path))
+    savemat(path, {"S": np.eye(2)}, do_compression=True)
+    path.write_bytes(path.read_bytes()[:-2])  # of the sum that tells whether all was read
+    with refused("a.mat cannot be read ('compressed data end too soon')"):
+        read_mat(str(path))
     path.write_bytes(whole[:124] + b"\0\2" + whole[126:])  # as -v7.3 begins
     with refused("a.mat cannot be read ('it is of no version up to 7'); save it with -v7"):
         read_mat(str(path))

@@ -18,7 +18,7 @@ from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, observer_matrices, weakest
 from gpebo_cli.observers.reduced.regression import Assembled, term_sizes
-from gpebo_cli.observers.reduced.split import axes_frame, constant_split
+from gpebo_cli.observers.reduced.split import axes_frame, constant_split, split_in_frame
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
 from gpebo_cli.settings import SolverSettings, TimeSettings
@@ -185,6 +185,9 @@ def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_p
         np.testing.assert_allclose(value, exact, rtol=1e-12, atol=1e-300)
         assert floor == pytest.approx(least)
     assert found.lost(by) == pytest.approx(5.0 / largest[3])
+    rounding[1, 2], rounding[3, 2] = 1e-3, 0.0  # of the state that is an offset
+    by = rounding * of_states[:, None] / of_states
+    assert found.lost(by) == pytest.approx(0.05 / (10.0 if offset else largest[1]))
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-20])
@@ -460,6 +463,17 @@ def test_a_kernel_that_stays_is_told_from_one_that_turns_in_any_units(units, siz
     assert constant_split(moving @ turn / units, tuple("abcd"), units, 1e-10) is None
     small = constant_split(moving / units, tuple("abcd"), units, 1e-6)
     assert small is None or small.rank == 1
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("place", [(0, 1), (1, 0)])
+def test_a_frame_is_left_in_either_direction(place, sign):
+    """Of E = diag(2, 0): an entry in its kernel, or an equation outside of its range."""
+    E = np.broadcast_to(np.diag([2.0, 0.0]), (3, 2, 2)).copy()
+    frame, units = axes_frame(E[0]), np.ones(2)
+    assert split_in_frame(E, frame, units, 1e-10).rank == 1
+    E[1][place] = sign * 1e-3
+    assert split_in_frame(E, frame, units, 1e-10) is None
 
 
 def test_axes_of_what_is_differentiated_are_exact():

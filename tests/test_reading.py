@@ -15,7 +15,7 @@ from processes import refused
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.observers.gpebo import Gpebo
 from gpebo_cli.reading import as_seen_from_here, beside, read_bytes
-from gpebo_cli.schema import LARGEST, nearest, number, per_name, read
+from gpebo_cli.schema import LARGEST, nearest, number, per_name, plain, read
 from gpebo_cli.settings import OutputSettings, SolverSettings, TimeSettings
 
 
@@ -105,6 +105,15 @@ def test_a_path_is_told_as_it_is_seen_from_here_where_that_is_shorter(tmp_path, 
     deep.mkdir(parents=True)
     monkeypatch.chdir(deep)
     assert as_seen_from_here(tmp_path.anchor) == tmp_path.anchor
+
+
+def test_content_from_python_is_what_a_file_would_say(tmp_path):
+    content = {"word": np.str_("ab"), "rows": (np.arange(2), range(2)), "size": np.float32(0.5),
+               "file": tmp_path, "raw": b"ab", "own": type("Word", (str,), {})("cd")}
+    found = plain(content)
+    assert found == {"word": "ab", "rows": [[0, 1], [0, 1]], "size": 0.5, "file": str(tmp_path),
+                     "raw": b"ab", "own": "cd"}
+    assert type(found["rows"][0][0]) is int
 
 
 def test_nearest_says_nothing_when_nothing_is_near():
