@@ -14,6 +14,7 @@ from processes import assert_refused, printed
 from scipy.integrate import solve_ivp
 from test_cli import folders
 
+from gpebo_cli import run
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.estimators import build
 from gpebo_cli.experiment.noise import (
@@ -170,6 +171,13 @@ def test_quantisation_rounds_what_is_sampled():
     _, noisy = seen(shipped("descriptor"), quantisation=0.25, sample_time=0.1, outputs=0.5)
     steps = noisy.outputs(t) / 0.25
     assert steps == pytest.approx(np.rint(steps), abs=1e-9)
+
+
+def test_a_result_has_the_rounded_outputs_of_a_sensor_without_noise():
+    noise = {"name": "gaussian", "outputs": 0, "quantisation": 0.25, "sample_time": 0.1}
+    found = run("descriptor", noise=noise, time={"horizon": 2, "samples": 21}).details.signals
+    rounded = np.rint(found.outputs / 0.25)[:-1]  # the last time still belongs to the sample before
+    assert found.measured_outputs[:-1] / 0.25 == pytest.approx(rounded, abs=1e-9)
 
 
 def test_what_has_no_name_in_a_mapping_of_levels_has_no_noise():

@@ -101,7 +101,7 @@ def _power(low: Any, high: Any, exponent: Any, _: Any) -> Any:
 
 def _reached(low: Any, high: Any, at: float, period: float) -> Any:
     """Whether cells hold ``at`` + k ``period``; what rounding might move into them counts, too."""
-    slack = 4e-16 * np.maximum(np.abs(low), np.abs(high)) + 1e-15
+    slack = 4e-16 * np.maximum(-low, high) + 1e-15
     first, last = (low - at - slack) / period, (high - at + slack) / period
     return (np.ceil(first) <= np.floor(last)) | ~np.isfinite(last - first)
 
