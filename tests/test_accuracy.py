@@ -159,7 +159,7 @@ def test_states_that_are_rounding_count_as_zero():
 
 def test_states_are_no_zeros_where_rounding_has_grown():
     """Of those of a chaotic plant nothing is known, but they are as large as others."""
-    mesh, units = Mesh(np.array([0.0, 1.0]), radau_rule(3)), np.array([1.0, 1e-3, 1e3])
+    mesh, units = Mesh(np.array([0.0, 1.0]), radau_rule(3)), np.array([1.0, 1e-9, 1e3])
     values = np.ones((1, 4, 3)) * units
     values[..., 2] *= 1e-18
     simulation = SimpleNamespace(
