@@ -17,7 +17,7 @@ from gpebo_cli.numerics.mesh import Trajectory, initial_mesh
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.observers import Measurements, observe
 from gpebo_cli.observers.reduced.matrices import AlgebraicEquations, observer_matrices, weakest
-from gpebo_cli.observers.reduced.regression import Assembled, term_sizes
+from gpebo_cli.observers.reduced.regression import Assembled, regression_signals, term_sizes
 from gpebo_cli.observers.reduced.split import axes_frame, constant_split, split_in_frame
 from gpebo_cli.reduction.form import EquationForm
 from gpebo_cli.reduction.scaling import Units
@@ -188,6 +188,18 @@ def test_signals_are_resolved_in_sizes_of_their_own_in_any_units(of_states, of_p
     rounding[1, 2], rounding[3, 2] = 1e-3, 0.0  # of the state that is an offset
     by = rounding * of_states[:, None] / of_states
     assert found.lost(by) == pytest.approx(0.05 / (10.0 if offset else largest[1]))
+
+
+def test_what_moves_with_a_parameter_adds_up_over_coordinates_of_either_sign():
+    """Of x = B z with B = [1 −1; 1 2; 0 1], where one equation sees z₁."""
+    rng, basis = np.random.default_rng(2), np.array([[1.0, -1.0], [1.0, 2.0], [0.0, 1.0]])
+    z, nothing = rng.normal(size=(5, 2, 4)), np.zeros((1, 1, 0))
+    found = regression_signals(z, basis, AlgebraicEquations(
+        np.array([[[1.0, 0.0]]]), np.zeros((5, 1)), np.zeros((1, 1, 1)), nothing,
+        np.zeros((1, 3, 0)), np.ones(1),
+    ))
+    first, second = np.abs(z[:, :, 1:]).max(axis=0)
+    np.testing.assert_allclose(found.moving, [first + second, first + 2.0 * second, second])
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-20])
