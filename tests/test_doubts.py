@@ -57,6 +57,7 @@ def test_how_far_estimates_are_off_least_squares_is_told_in_their_sizes():
     assert warning.startswith(
         f"estimates.csv: at the end a, b, c, x, y are up to {share.max():.2g} of their size away "
     )
+    assert warning.endswith(", or it forgets, as it has to where an unknown changes")
     leaves = [np.linalg.norm(Y - PSI @ eta) / np.linalg.norm(Y) for eta in (LEAST, LEAST + off)]
     of_least, of_them = re.findall(r"leaves (\S+) of Y and they (\S+):", warning)[0]
     assert (of_least, of_them) == tuple(f"{share:.1g}" for share in leaves)

@@ -669,6 +669,18 @@ def test_drag_that_grows_with_speed_damps_by_the_speed_on_the_way():
     }
 
 
+def test_equations_without_constraints_and_of_first_order_are_linearised():
+    """100 T' + 2 (T − 290) + T⁴ by T = 3: no mass, and 4 T³ beside the conductance."""
+    t = sp.Symbol("t")
+    T = sp.Function("T")(t)
+    model = linearise([100 * T.diff(t) + 2 * (T - 290) + T**4], [], {T: sp.Integer(3)}, [])
+    assert model == {
+        "positions": ["T"], "M": [["0"]], "D": [["100"]], "K": [["110"]], "G": [],
+    }
+    states = from_mechanics({**model, "measure": ["T"]}, "m").mapping()["states"]
+    assert states == ["T", "v_T"]
+
+
 def test_entries_of_a_mechanism_may_be_numbers_and_text_of_either_sign():
     """M q'' + D q' + K q = B u."""
     draft = from_mechanics({

@@ -1090,6 +1090,14 @@ def test_each_guess_has_its_reason_and_each_doubt_is_told(tmp_path, head, time, 
     assert {key: getattr(found, key) for key in said} == said
 
 
+def test_no_factor_is_asked_for_between_units_whose_zeros_differ(tmp_path):
+    (tmp_path / "lab.csv").write_text("t,V,y [°C]\n0,1,20\n")
+    plant = replace(shipped("circuit"), units={"y": "K"})
+    [doubt] = guess(str(tmp_path / "lab.csv"), plant).doubts
+    assert doubt.startswith("column y [°C] may be in °C, y is in K: their zeros differ, ")
+    assert "data.scale" not in doubt
+
+
 def test_a_row_of_units_and_numbers_of_rows_are_said(tmp_path):
     path = tmp_path / "lab.csv"
     path.write_text("t (ms);V;y\n[ms];[V];[A]\n0;1,5;2\n10;1,6;2\n")

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from inprocess import gpebo
-from plants import shipped
+from plants import one_state, shipped
 from processes import assert_refused, refused
 from test_remedies import UNBOUNDED
 
@@ -155,6 +155,20 @@ def test_of_several_recordings_with_an_observer_of_later_states(tmp_path):
     with refused("several files need an observer whose parameters are θ and the initial error; "
                  "accepted is observer=gpebo with remedy none, output_injection or noise_free"):
         run("circuit", data={"name": "csv", "file": files}, observer=observer)
+
+
+@pytest.mark.parametrize(("state", "observer", "message"), [
+    ("x_2", {}, "plant p: e0_x_2 is an estimated parameter twice; every name must be used once"),
+    ("w_x", {"name": "kalman_bucy"}, "plant p: w_x is an estimated parameter and a state; every"),
+])
+def test_of_parameters_that_would_share_a_name(tmp_path, state, observer, message):
+    """e0_x_2 is that of x in the second file and of x_2 in the first; a filter estimates w_x."""
+    plant = one_state(
+        states=["x", state], E=np.eye(2), A=-np.eye(2), C=[[1, 1]], initial_state=[0, 0]
+    )
+    ROWS.to_csv(file := str(tmp_path / "a.csv"), index=False)
+    with refused(message):
+        run(plant, data=[file, file] if not observer else file, observer=observer or "gpebo")
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -929,6 +929,19 @@ def test_a_bad_row_ends_a_stream_after_the_rows_before_it(tmp_path, rows):
 
 
 @pytest.mark.parametrize(
+    ("policy", "notes"),
+    [("hold", ["rows left out (data.missing=hold): 1,", "cells filled (data.missing=hold): 4,"]),
+     ("drop", ["rows left out (data.missing=drop): 4,"])],
+)
+def test_a_stream_says_what_became_of_gaps(tmp_path, rows, policy, notes):
+    gaps = ["0.06,1,\n", "0.07,,\n", "0.08,2,\n"]
+    text = "".join([rows[0], "-1,1,\n", *rows[1:7], *gaps])
+    done = gpebo(*COMMAND, f"data.missing={policy}", cwd=tmp_path, text=text)
+    assert done.returncode == 0
+    assert [note for note in notes if note in done.stderr] == notes
+
+
+@pytest.mark.parametrize(
     ("text", "part"),
     [("", "is empty"), ("t,V,y\n", "no rows"), ("t,V\n", "no column y"), ("t;V;y\n", "semicolons")],
 )

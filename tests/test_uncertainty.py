@@ -739,7 +739,7 @@ def test_resets_that_do_not_say_what_errors_do_have_no_deviations(monkeypatch):
     found = run("descriptor", observer={"name": "gpebo", "remedy": "reset", "reset_times": [1.0]},
                 noise=NOISE, time={"horizon": 2.0, "samples": 3})
     assert found.details.estimation.parameters_std is None
-    assert "this remedy cannot tell" in found.verdict
+    assert "its remedy cannot tell" in found.verdict
 
 
 @pytest.mark.parametrize(("plant", "more", "why"), [

@@ -15,6 +15,7 @@ import numpy as np
 
 from gpebo_cli.errors import ConfigError
 from gpebo_cli.experiment.pipeline import stream, stream_verdict
+from gpebo_cli.experiment.verdict import rows_note
 from gpebo_cli.kernels.threads import one_thread
 from gpebo_cli.model.descriptor import DescriptorSystem
 from gpebo_cli.recordings.lines import LineReader, samples
@@ -57,7 +58,8 @@ def run(settings: Settings, system: DescriptorSystem) -> int:
     if online is None:
         what = "is empty" if reader.header is None else "has no rows below its header"
         raise ConfigError(f"{_SOURCE} {what}")
-    sys.stderr.write(f"{stream_verdict(online)}\n")
+    note = rows_note(reader.left_out, reader.filled, settings.data.missing)
+    sys.stderr.write(f"{stream_verdict(online)}{note}\n")
     return 0
 
 

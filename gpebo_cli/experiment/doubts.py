@@ -126,7 +126,7 @@ def of_estimates(
         f"estimates.csv: at the end {', '.join(compress(quantities, far))} are up to "
         f"{(away / own)[far].max():.2g} of their size away from least squares over the same data, "
         f"which leaves {least / size:.1g} of Y and they {np.hypot(least, more[best]) / size:.1g}: "
-        "the estimator has lost digits or is not done; use estimator=least_squares with a small "
-        "f0, or other gains"
+        "the estimator has lost digits or is not done (use estimator=least_squares with a small "
+        "f0, or other gains), or it forgets, as it has to where an unknown changes"
     )
     return told, (text,)

@@ -29,7 +29,7 @@ _ROUNDING = (
 _NOT_SAID = "the estimator does not say what errors of Y do to it"
 _IN_MATRICES = (
     "noise of the signals is in the matrices (of outputs observer.remedy=noise_free takes it out) "
-    "or differentiated, or this remedy cannot tell what it does"
+    "or differentiated, or this observer or its remedy cannot tell what it does"
 )
 
 

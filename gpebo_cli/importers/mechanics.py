@@ -164,8 +164,8 @@ def linearise(
         back = found.subs([(symbol, variable) for variable, symbol in plain.items()])
         return [[str(entry) for entry in row] for row in back.subs(followed).tolist()]
 
-    held = sympy.Matrix(constraints)
-    reaction = held.jacobian(list(motion)).T * sympy.Matrix(multipliers)
+    held, forces = (sympy.Matrix(len(part), 1, list(part)) for part in (constraints, multipliers))
+    reaction = held.jacobian(list(motion)).T * forces
     rest = sympy.Matrix(equations) - reaction
     return {
         "positions": [str(coordinate.func) for coordinate in motion],

@@ -252,10 +252,10 @@ def _find_signals(
 def _find_scale(signal: str, name: str, written: str, unit: str, found: Guess) -> None:
     factor = _factor(written, unit)
     if factor is None:
-        found.doubts.append(
-            f"column {name} may be in {written}, {signal} is in {unit}: "
-            f"data.scale.{signal} is the factor between them"
-        )
+        how = f"data.scale.{signal} is the factor between them"
+        if "degC" in (_as_usual(written)[1], _as_usual(unit)[1]):
+            how = f"their zeros differ, which no factor mends: write the plant in {written}"
+        found.doubts.append(f"column {name} may be in {written}, {signal} is in {unit}: {how}")
     if factor != 1.0:
         found.scale[signal] = factor or 1.0
         found.reasons[f"scale.{signal}"] = f"{written} in the header, {unit} here" + (

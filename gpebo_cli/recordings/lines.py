@@ -261,6 +261,7 @@ class LineReader:
         self._reader: RowReader | None = None
         self.header: Header | None = None  # once it is there
         self._before: list[float] = []
+        self.left_out, self.filled = 0, 0  # rows; cells of inputs and outputs
         self._blank: list[tuple[int, bytes]] = []  # at the end of a table blank lines do not count
 
     def feed(self, piece: bytes, *, last: bool = False) -> tuple[list[list[float]], str]:
@@ -300,11 +301,12 @@ class LineReader:
             self._reader = RowReader(self.header, self._data)
             return
         row = self._reader.read(number, cells)
-        if any(map(math.isnan, row)):
-            if self._data.missing == "drop":
-                return
+        gaps = list(map(math.isnan, row))
+        if self._data.missing != "drop":
             held = self._before or row
-            row = [held[k] if math.isnan(value) else value for k, value in enumerate(row)]
-        self._before = row
-        if not any(map(math.isnan, row)):
-            yield row
+            self._before = row = [held[k] if gap else row[k] for k, gap in enumerate(gaps)]
+        if any(map(math.isnan, row)):
+            self.left_out += 1
+            return
+        self.filled += sum(gaps[: 1 + self._system.m + self._system.r])
+        yield row

@@ -143,7 +143,7 @@ def estimate_table(result: RunResult) -> list[str]:
         deviation = "" if std is None or not math.isfinite(std) else f"{std:.2g}"
         shown = f"{value:.6g}"
         if estimation.still[case] and name in estimation.names:
-            shown, since = f"not moved from {shown}", ""
+            shown, since = f"not moved from {over_time[0, names.index(name)]:.6g}", ""
         rows.append([name, shown, deviation, told["unit"] or "", since, estimable])
     return columns(rows)
 
