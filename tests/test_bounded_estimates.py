@@ -372,7 +372,7 @@ def test_bounds_hold_on_both_sides_of_a_jump(u):
 
 
 def test_bounds_hold_before_a_jump_that_is_less_than_what_leads_to_it():
-    """z = x + u with x = 1 is −0.3 just before 1.3 s, and more at all nodes, as it is from then on."""
+    """z = x + u with x = 1 is −0.3 just before 1.3 s, and more at nodes, as from then on."""
     plant = one_state(
         states=["x", "z"], inputs={"u": "-t + (0.001 + 0.9999*(t - 1.3))*step(t - 1.3)"},
         E=[[1, 0], [0, 0]], A=[[0, 0], [1, -1]], B=[[0], [1]], C=[[1, 0]], initial_state=[1, 1],

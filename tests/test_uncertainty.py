@@ -586,6 +586,19 @@ def test_settled_is_within_two_deviations_of_the_end_from_then_on():
     )[0, 0] == 1.0
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_state_of_constants_has_settled_as_they_have(seed):
+    """Of y = x = const least squares is a mean, σ = 0.05/√(10 t), and all that moves x̂ is ê₀."""
+    found = run(
+        one_state(), estimator="least_squares", time={"horizon": 10, "samples": 201},
+        noise={"name": "gaussian", "outputs": 0.05, "sample_time": 0.1, "seed": seed},
+    ).details
+    away = np.abs(found.estimation.parameters[0, :, 0] - found.estimation.parameters[0, -1, 0])
+    for name, at in ("e0_x", 10.0), ("x", 7.5):  # of states the largest of the last quarter
+        last = found.estimation.t[away > 0.1 / np.sqrt(10.0 * at)][-1]
+        assert last <= found.metrics.seconds_to_settled[name][0] <= last + 0.05 + 1e-9
+
+
 NOISE = {"name": "gaussian", "outputs": 0.05}
 
 
