@@ -19,7 +19,7 @@ from gpebo_cli.estimators import ErrorSystem, LinearRegression
 from gpebo_cli.evidence import uncertainty
 from gpebo_cli.evidence.error_maps import error_maps
 from gpebo_cli.evidence.metrics import settling_times
-from gpebo_cli.evidence.uncertainty import _agree, _layered, deviations, noise_level
+from gpebo_cli.evidence.uncertainty import _agree, _layered, _mesh, deviations, noise_level
 from gpebo_cli.experiment import uncertainty as of_runs
 from gpebo_cli.experiment.pipeline import stream
 from gpebo_cli.experiment.result import Fit
@@ -826,6 +826,15 @@ def test_layers_are_behind_samples_before_what_is_looked_at_in_any_unit_of_time(
     made = _layered(mesh, samples, 20.0 / unit, t)
     np.testing.assert_allclose(made.edges / unit, [0, 1 / 27, 1 / 9, 1 / 3, 1, 2, 3], atol=1e-15)
     assert _layered(mesh, samples, 0.9 / unit, t) is mesh
+
+
+@pytest.mark.parametrize("begin", [1e9, -1e9])
+def test_elements_behind_a_start_are_no_rounding_of_times_before_or_after_zero(begin):
+    """Halves of the first 0.01 s, down to 1e-12 of the times, which here is 1e-3 s."""
+    edges = begin + np.array([0.0, 0.01, 0.02])
+    made = _mesh(edges, SimpleNamespace(starts=edges, others=np.zeros(0)), edges[:1])
+    expected = [0.0, 0.00125, 0.0025, 0.005, 0.01, 0.02]
+    np.testing.assert_allclose(made.edges - begin, expected, atol=3e-7)
 
 
 @pytest.mark.parametrize("apart", [True, False])
