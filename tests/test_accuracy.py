@@ -91,6 +91,17 @@ def settled_by_hand(t, away, level):
     return t[above[-1] + 1] - t[0] if len(above) else 0.0
 
 
+def test_estimates_settle_by_the_deviation_of_the_last_time_though_it_just_fell():
+    one = np.ones((1, 4, 1))
+    estimation = SimpleNamespace(
+        t=np.arange(4.0), names=("a",), parameters=np.array([8.0, 3.0, 1.5, 0.0])[None, :, None],
+        parameters_std=one * [[10.0], [10.0], [10.0], [1.0]], states_std=one,
+    )
+    metrics, system = Metrics(*np.zeros((5, 1))), SimpleNamespace(states=("x",), q=1)
+    found = accuracy.standing(estimation, metrics, one[..., None], system).seconds_to_settled
+    assert 1.0 < found["a"][0] <= 2.0
+
+
 @pytest.mark.parametrize("told", ["gains", "filter", "seeds", "nothing"])
 def test_estimates_have_settled_where_they_are_within_two_deviations_of_the_end(told):
     """Of states what the final parameters make of the signals; of a filter what it has to learn.

@@ -196,6 +196,7 @@ def test_a_saved_folder_repeats_itself(tmp_path):
     result = run(tmp_path / "mine.yaml", gamma=(1, 2.5), time={"samples": 51})
     folder = result.save(tmp_path / "first", figures=False)
     assert folder == tmp_path / "first"
+    assert yaml.safe_load((folder / "config.yaml").read_text())["figures"] == "none"
     assert_repeats(folder, "signals.csv", "estimates.csv", "cases.csv")
 
 

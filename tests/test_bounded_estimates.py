@@ -371,6 +371,19 @@ def test_bounds_hold_on_both_sides_of_a_jump(u):
     assert result.estimates["z"].min() > -0.3 - 1e-6
 
 
+def test_bounds_hold_before_a_jump_that_is_less_than_what_leads_to_it():
+    """z = x + u with x = 1 is −0.3 just before 1.3 s, and more at nodes, as from then on."""
+    plant = one_state(
+        states=["x", "z"], inputs={"u": "-t + (0.001 + 0.9999*(t - 1.3))*step(t - 1.3)"},
+        E=[[1, 0], [0, 0]], A=[[0, 0], [1, -1]], B=[[0], [1]], C=[[1, 0]], initial_state=[1, 1],
+    )
+    result = run(
+        plant, observer={"bounds": {"states": {"z": [-0.2995, None]}}}, estimator="least_squares",
+        time={"horizon": 2, "samples": 3},
+    )
+    assert result.estimates["x"][0, -1] == pytest.approx(1.0005, abs=1e-7)
+
+
 def test_a_state_that_an_input_determines_later_is_held_where_estimates_move_it():
     """z = x = 1 up to t = 2 and then u; of k + (x(0) − k) e^-t below 0.8 the best is 0.8 itself."""
     plant = one_state(

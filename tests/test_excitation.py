@@ -113,8 +113,11 @@ def test_a_window_of_samples_of_a_circle(hold):
 
 
 def test_t_c_of_a_state_that_grows_is_that_of_what_is_known_of_it_by_then():
-    """x' = a x and ψ = 1: G = (1 − e^(−2 a t))/(2 a) of the x of now, from the first element on."""
-    for rho, a in (5e-3, 10.0), (0.1, 1.0):
+    """x' = a x and ψ = 1: G = (1 − e^(−2 a t))/(2 a) of the x of now, from the first element on.
+
+    Just before the end, too.
+    """
+    for rho, a in (5e-3, 10.0), (0.1, 1.0), (0.5 * -np.expm1(-2.0 * 0.9999), 1.0):
         observer = {"name": "gpebo", "remedy": "current_coordinates"}
         found = run(
             one_state(A=[[a]]), observer=observer, estimator="least_squares",

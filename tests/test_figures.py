@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -421,7 +422,7 @@ IN_MATHEMATICS = {
     "flow_of_tank": r"$\mathrm{flow}_{\mathrm{of},\mathrm{tank}}$",
 }
 NUMBERS = {1e10: "10¹⁰", -1e-7: "−10⁻⁷", 2.5e-7: "2.5·10⁻⁷", 0.5: "0.5", 0.0: "0",
-           9999.0: "9999", 1.5e4: "1.5·10⁴", -3.25: "−3.25"}
+           9999.0: "9999", 1.5e4: "1.5·10⁴", -3.25: "−3.25", -math.inf: "−inf"}
 GAINS = {"gamma": "γ", "gamma_2": "γ₂", "f0": "f₀", "lambda_1": "λ₁", "window": "window"}
 
 

@@ -234,6 +234,14 @@ def test_a_loop_of_many_capacitors_is_one():
     )
 
 
+def test_a_cutset_is_what_crosses_its_border():
+    """Node a has inductors and a source alone; L3 and R1 do not touch it."""
+    text = "t\nI1 0 a SIN(0 1 1)\nL1 a b 1\nL2 a c 1\nL3 b c 1\nR1 b 0 1\nR2 c 0 1\n"
+    assert circuit_from_netlist(text, "c").comments[-1] == (
+        "index 2 by topology (cutset of inductors and current sources: I1, L1, L2)"
+    )
+
+
 def test_names_that_are_there_twice():
     """Element, parameter and node of one name, and words of Python, stay apart."""
     same = "names\n.param r1=2 lambda={r1/2}\nv1 v1 0 1\nr1 v1 c1 {r1}\nc1 c1 0 {lambda}\n"

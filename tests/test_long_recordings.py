@@ -437,11 +437,15 @@ def test_the_residual_of_two_long_files_is_that_of_their_rows(tmp_path):
 
 @pytest.mark.parametrize("hold", ["zoh", "linear"])
 def test_noise_of_two_files_is_white_however_many_times_are_asked_for(hold, tmp_path):
-    """Ten to a row, where what is held or interpolated between two rows is alike."""
-    t, noise, files = np.linspace(0.0, 4.0, 81), np.random.default_rng(0), []
-    for k in range(2):
-        y = 3.0 * np.exp(-t) + 0.1 * noise.standard_normal(81)
-        files.append(write_table(tmp_path / f"{k}.csv", {"t": t, "y": y}))
+    """Ten to a row and more, where what is held or interpolated between two rows is alike.
+
+    The rows of one file are farther apart.
+    """
+    noise, files = np.random.default_rng(0), []
+    for rows in 81, 41:
+        t = np.linspace(0.0, 4.0, rows)
+        y = 3.0 * np.exp(-t) + 0.1 * noise.standard_normal(rows)
+        files.append(write_table(tmp_path / f"{rows}.csv", {"t": t, "y": y}))
     found = run(one_state(A=[[-1]]), data={"file": files, "hold": hold},
                 estimator="least_squares", time={"samples": 1601})  # fmt: skip
     assert found.details.fit.white

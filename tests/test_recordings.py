@@ -1326,6 +1326,28 @@ def test_evidence_of_two_files_is_what_both_have_or_the_worse_of_either(order, t
     assert both.regression.error_estimate == worst
 
 
+def test_files_along_which_a_plant_has_other_constraints_have_no_deviations(tmp_path):
+    """0 = b in one of them and b' = −b in the other; that a constraint holds is a row of its ψ."""
+    files = []
+    for start in (0.0, 6.0):
+        t = np.linspace(start, start + 2.0, 41)
+        columns = {"t": t, "y": np.exp(start - t), "w": 0.0 * t}
+        files.append(write_table(tmp_path / f"{start:g}.csv", columns))
+    plant = one_state(
+        states=["a", "b"], outputs=["y", "w"], E=[[1, 0], [0, "step(t - 5)"]],
+        A=[[-1, 0], [0, -1]], C=[[1, 1], [0, 1]], initial_state=[1, 0],
+    )
+    both, *each = (
+        run(plant, data=data, time={"samples": 5}, estimator="least_squares")
+        for data in (files, *files)
+    )
+    assert [one.details.estimation.states_std is None for one in (both, *each)] == [
+        True, False, False,
+    ]
+    assert "no standard deviations" in both.verdict
+    np.testing.assert_allclose(both.estimates["a"][0, -1], np.exp(-2.0), rtol=1e-3)
+
+
 def test_signals_of_three_files_stand_one_after_the_other(tmp_path):
     """The first sample of a file takes the place of the last one of the file before."""
     t = np.array([0.0, 0.5, 1.0])

@@ -219,6 +219,21 @@ def test_a_gain_at_samples_is_the_one_in_continuous_time():
     assert made[1].estimation.requirement.holds
 
 
+@pytest.mark.parametrize("f0", [[1e-2, 1.0], [1.0, 1e-2]])
+def test_what_is_required_at_samples_is_of_the_group_that_has_the_least(f0):
+    """Of several f₀ the integral of Δ² is the least of those that each has alone."""
+    block = regression()
+
+    def integral(f0):
+        law = estimators.build({"name": "ls_drem", "f0": f0, "gamma": 1.0}).recursive("abc")
+        law.update(block)
+        return law.requirement.evidence["integral_delta_squared"]
+
+    each = [integral(one) for one in f0]
+    assert integral(f0) == pytest.approx(min(each), rel=1e-9)
+    assert max(each) > 1.1 * min(each)
+
+
 def test_at_most_as_many_samples_are_kept_as_are_asked_for():
     system = shipped("circuit")
     settings = Settings(
