@@ -222,6 +222,19 @@ def test_what_filters_leave_of_a_column_is_rounding():
     assert result.details.estimable["w_x1"] is None
 
 
+def test_what_stands_for_no_prior_is_no_data():
+    """No output sees what b acts on; in units in which it is small, F⁻¹ of rounding was regular."""
+    found = run({
+        "name": "half", "states": ["x1", "x2"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "unknowns": {"a": 2.0, "b": 1.0}, "E": [[1, 0], [0, 1]], "A": [[-1, 0], [0, -2]],
+        "B": [[1], [0]], "F": [[1, 0], [0, 1]], "C": [[1, 0]], "initial_state": [1, 1],
+    }, observer={"name": "gpebo", "remedy": "current_coordinates"},
+        estimator={"name": "least_squares", "f0": None}, time={"horizon": 3, "samples": 5}).details
+    assert found.estimable["a"] is not None
+    assert found.estimable["b"] is None
+    assert not found.estimation.requirement.holds
+
+
 @pytest.mark.parametrize(
     ("name", "moving"), [("window", [0, 1]), (1, [0, 1]), ("rotating", [0, 1, 2, 3])]
 )
