@@ -162,7 +162,8 @@ class LeastSquares(ResumableEstimator):
                     own = filtered(*filters).final[None]
             from_data.append(own[-1])
             if "f0" not in case:
-                energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
+                energy = np.einsum("mjj->mj", gram[..., :p])
+                rounding = regression.rounding_of(gram, t)
                 units = prior_units(energy, regression.terms(t), t - begin, rounding)
                 gram = gram + units[..., None] ** 2 * prior
             return gram
