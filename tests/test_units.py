@@ -307,6 +307,16 @@ def test_least_squares_keeps_its_digits_in_any_units(name):
     assert found * unit == pytest.approx(truth, rel=1e-9)
 
 
+@pytest.mark.parametrize("name", ["drem", "instrumental"])
+def test_mixing_keeps_its_digits_in_any_units(name):
+    """In these units Ω has singular values 1e-20 of its largest, and estimates stood still."""
+    units = Units(np.ones(3), np.array([1e-5, 1e5]), np.ones(1), np.ones(1), np.ones(3), 1.0)
+    content = yaml.safe_load((CONF / "plant/descriptor.yaml").read_text(encoding="utf-8"))
+    found = run(in_units(content, units), estimator=name, gamma=1e14,
+                time={"horizon": 10, "samples": 3}).details.estimation
+    np.testing.assert_allclose(found.parameters[0, -1], found.true_parameters[-1], rtol=1e-6)
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1e9])
 def test_a_regression_of_functions_and_its_data_have_sizes_in_their_units(unit):
     regression = LinearRegression.from_functions(
