@@ -998,3 +998,13 @@ def test_resets_make_no_knowledge_of_rounding():
                               "reset_times": [0.9, 1.8]})
     known = {name: found.details.estimable[name] is not None for name in determined}
     assert known == determined
+
+
+def test_nothing_starts_again_where_there_is_nothing_to_estimate():
+    """E = 0 and no unknowns: there is no parameter to transport."""
+    found = api_run({
+        "name": "algebraic", "states": ["a", "b"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "E": [[0, 0], [0, 0]], "A": [[1, "sin(t)/2"], [0.3, 2]], "B": [[1], [0]], "C": [[1, 0]],
+        "initial_state": [0, -1],
+    }, time={"horizon": 3, "samples": 5}, observer={"remedy": "reset", "reset_interval": 1.0})
+    np.testing.assert_allclose(found.estimates["b"][0], found["b"], atol=1e-12)
