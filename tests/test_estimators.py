@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plants import CONF, observed, one_state, reference, shipped
 from processes import write_table
+from random_systems import HORIZON, random_system
 from regressions import ETA, adjugate, fading, integrate, regression, three
 from scipy.integrate import cumulative_trapezoid, quad, quad_vec, solve_ivp, trapezoid
 
@@ -1557,3 +1558,14 @@ def test_a_gain_that_no_data_ask_for_is_the_usual_one():
     plant = one_state(A=[[-1]], C=[["max(0, t - 8)"]])
     found = api_run(plant, estimator="drem", gamma="auto", time={"horizon": 3.0})
     assert [case["gamma"] for case in found.cases] == [1e10]
+
+
+def test_power_does_not_move_where_nothing_is_known():
+    """Δ is below 2e-16; where 𝐘/Δ was rounding Newton's method left for 1e21 and a step of 0.06."""
+    found = api_run(
+        random_system(241)[0], time={"horizon": HORIZON, "samples": 3}, initial=0.67,
+        estimator="power", gamma=14, gamma2=3.13e7, alpha=0.3, **{"lambda": 1.79},
+        observer={"name": "gpebo", "form": "strangeness_free"}, solver={"stages": 8, "tol": 1e-9},
+    ).details.estimation
+    assert np.abs(found.delta).max() < 2e-16
+    np.testing.assert_allclose(found.parameters, 0.67, rtol=1e-9)

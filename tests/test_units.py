@@ -222,6 +222,19 @@ def test_what_filters_leave_of_a_column_is_rounding():
     assert result.details.estimable["w_x1"] is None
 
 
+def test_what_stands_for_no_prior_is_no_data():
+    """No output sees what b acts on; in units in which it is small, F⁻¹ of rounding was regular."""
+    found = run({
+        "name": "half", "states": ["x1", "x2"], "inputs": {"u": "sin(t)"}, "outputs": ["y"],
+        "unknowns": {"a": 2.0, "b": 1.0}, "E": [[1, 0], [0, 1]], "A": [[-1, 0], [0, -2]],
+        "B": [[1], [0]], "F": [[1, 0], [0, 1]], "C": [[1, 0]], "initial_state": [1, 1],
+    }, observer={"name": "gpebo", "remedy": "current_coordinates"},
+        estimator={"name": "least_squares", "f0": None}, time={"horizon": 3, "samples": 5}).details
+    assert found.estimable["a"] is not None
+    assert found.estimable["b"] is None
+    assert not found.estimation.requirement.holds
+
+
 @pytest.mark.parametrize(
     ("name", "moving"), [("window", [0, 1]), (1, [0, 1]), ("rotating", [0, 1, 2, 3])]
 )
@@ -292,6 +305,16 @@ def test_least_squares_keeps_its_digits_in_any_units(name):
     estimator = estimators.build({"name": name, "f0": 1e-200, **more})
     found = estimator.estimate(regression, np.array([0.0, 2.0])).parameters(slice(None))[0, -1]
     assert found * unit == pytest.approx(truth, rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["drem", "instrumental"])
+def test_mixing_keeps_its_digits_in_any_units(name):
+    """In these units Ω has singular values 1e-20 of its largest, and estimates stood still."""
+    units = Units(np.ones(3), np.array([1e-5, 1e5]), np.ones(1), np.ones(1), np.ones(3), 1.0)
+    content = yaml.safe_load((CONF / "plant/descriptor.yaml").read_text(encoding="utf-8"))
+    found = run(in_units(content, units), estimator=name, gamma=1e14,
+                time={"horizon": 10, "samples": 3}).details.estimation
+    np.testing.assert_allclose(found.parameters[0, -1], found.true_parameters[-1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("unit", [1e-9, 1e9])

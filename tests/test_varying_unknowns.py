@@ -175,3 +175,19 @@ def test_error_norms_are_of_theta(tmp_path):
     assert final.size == pytest.approx(max(size, np.linalg.norm(x, axis=1).max()))
     read = read_errors(read_run("a", tmp_path / "a", {}))
     np.testing.assert_allclose([each.parameters for each in read], theta, rtol=1e-9)
+
+
+@pytest.mark.parametrize("bounds", [None, {"unknowns": {"theta1": [-9, 9]}}])
+def test_statistics_over_seeds_are_about_the_same_truth_as_a_run(bounds):
+    """What is true of e₀ follows from all that θ did; bounds observe each seed by itself."""
+    plant = {
+        "name": "step", "states": ["x"], "outputs": ["y"], "E": [[1]], "A": [[-0.5]],
+        "unknowns": {"theta1": "1 + step(t - 1)"}, "F": [[1]], "C": [[1]], "initial_state": [1],
+    }
+    found = run(plant, time={"horizon": 2, "samples": 21}, estimator="ls_drem", uncertainty=False,
+                observer={"name": "gpebo", "bounds": bounds},
+                noise={"name": "gaussian", "sample_time": 0.1, "outputs": 0.01, "seeds": 2}).details
+    assert found.estimation.true_parameters[-1, 1] != found.estimation.true_parameters[0, 1]
+    np.testing.assert_allclose(found.noise.truth, found.estimation.true_parameters[-1], rtol=1e-9)
+    first = found.estimation.parameters[:, -1] - found.noise.truth
+    assert (np.abs(first - found.noise.bias) < 10 * found.noise.deviation).all()

@@ -55,7 +55,7 @@ class FilteredEstimator(ResumableEstimator):
         before = known[0].values if known else None
         extended = self.extend(regression, filter_rates(self.rates, regression.parameters), before)
         return mixed_estimates(
-            self, regression, (mix(extended, t, regression.floor),),
+            self, regression, (mix(extended, t, regression.floor, regression.units),),
             lambda: (reached(self.size(regression), extended, known),), known,
         )
 

@@ -415,23 +415,32 @@ def resolved_for(path: ScalarPath, gains: Array) -> ScalarPath:
         )
 
 
-def mix(extended: Trajectory, t: Array, floor: float = 0.0) -> ScalarPath:
+def mix(
+    extended: Trajectory, t: Array, floor: float = 0.0, units: Array | float = 1.0
+) -> ScalarPath:
     """Mix [Ω | 𝒴] (p, p + c): the path that the scalar law takes, reported at the times t (M,).
 
-    The law takes c realisations as p·c parameters, in the order of (p, c) (SolverError: Ω or Δ² is
-    beyond what a number can be; names the time).
+    The law takes c realisations as p·c parameters, in the order of (p, c). Whether Ω is singular is
+    judged in ``units`` (p,) in which parameters are comparable (SolverError: Ω or Δ² is beyond what
+    a number can be; names the time).
     """
     p, mesh = extended.values.shape[-2], extended.mesh
     refuse_overflow("Ω, which is made of squares of ψ,", mesh, extended.values)
+    units = np.broadcast_to(units, p)[:, None]
+    size = float(np.prod(units**2))
+    if (units != 1.0).any():
+        columns = np.append(units, np.ones(extended.values.shape[-1] - p))
+        extended = Trajectory(mesh, extended.values * units * columns)
 
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
         delta, Y, digits = determinant_and_adjugate_action(values[..., :p], values[..., p:])
-        return delta, Y.reshape(len(t), -1), digits
+        return delta / size, (units * Y / size).reshape(len(t), -1), digits
 
     whole, points = extended.values, extended.values.shape[:2]
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
+    delta, quotient = delta / size, units * quotient
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     digits = reciprocals(condition, usable)
     refuse_overflow("Δ² of Δ = det(Ω)", mesh, delta.reshape(points) ** 2)

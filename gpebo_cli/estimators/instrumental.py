@@ -98,7 +98,8 @@ class Instrumental(WindowedEstimator):
         names, means = regression.parameters, self.means(regression, known)
         rows = means.values.reshape(-1, *means.values.shape[2:])
         square = (self.left(rows, names) @ rows).reshape(*means.values.shape[:2], len(names), -1)
-        path = mix(Trajectory(means.mesh, square), np.asarray(t), regression.floor)
+        extended = Trajectory(means.mesh, square)
+        path = mix(extended, np.asarray(t), regression.floor, regression.units)
         return mixed_estimates(
             self, regression, (path,), lambda: (ExtensionState(means.final, 0.0),), known
         )

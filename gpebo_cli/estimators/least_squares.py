@@ -162,14 +162,16 @@ class LeastSquares(ResumableEstimator):
                     own = filtered(*filters).final[None]
             from_data.append(own[-1])
             if "f0" not in case:
-                energy, rounding = np.einsum("mjj->mj", gram[..., :p]), regression.rounding_of(gram)
+                energy = np.einsum("mjj->mj", gram[..., :p])
+                rounding = regression.rounding_of(gram, t)
                 units = prior_units(energy, regression.terms(t), t - begin, rounding)
-                gram += units[..., None] ** 2 * prior
+                gram = gram + units[..., None] ** 2 * prior
             return gram
 
         of_cases = zip(self.cases, known or repeat(None), strict=False)
         extensions = np.array([extended(*own) for own in of_cases])
-        found = solved(extensions, np.array(from_data)[..., :p], dynamics.units)
+        own = np.array(from_data)[..., :p]
+        found = solved(extensions, own, dynamics.units, prior=self.f0 is not None)
         return replace(found, reached=tuple(reached))
 
     def resume(self, regression: LinearRegression, t: Array, known: Known) -> LeastSquaresEstimates:
@@ -186,7 +188,7 @@ class LeastSquares(ResumableEstimator):
         )
 
 
-def solved(extended: Array, from_data: Array, units: Array) -> Found:
+def solved(extended: Array, from_data: Array, units: Array, *, prior: bool = True) -> Found:
     """η̂ = F 𝒴 from [F⁻¹ | 𝒴] of every case (cases, M, p, p + 1), where that is more than rounding.
 
     It is solved in units of each parameter's own size; directions of rounding are left at zero.
@@ -208,7 +210,7 @@ def solved(extended: Array, from_data: Array, units: Array) -> Found:
     left = 1.0 - np.linalg.eigvalsh(transpose(root) @ own @ root)[:, 0] - rounding
     reached = float((1.0 / np.maximum(left, _DIGITS) - 1.0).min())
     if worst >= _DIGITS and reached < _NEEDED:
-        return Found(np.asarray(eta[..., 0]), ratio_requirement(reached, prior=True))
+        return Found(np.asarray(eta[..., 0]), ratio_requirement(reached, prior))
     return Found(np.asarray(eta[..., 0]), Requirement(
         name="F⁻¹ regular", holds=worst >= _DIGITS,
         evidence={"reciprocal_condition": worst, "needed": _DIGITS},

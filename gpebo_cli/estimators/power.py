@@ -190,7 +190,8 @@ class PowerEstimates(MixedEstimates):
         power of r is not, and η̂ follows by integration. Steps and Δ may be the same for all laws.
         """
         # Where 𝐘/Δ is rounding nothing is known, and the estimate does not move.
-        rest = np.where(_known(delta, digits), Y - delta * eta[:, None], 0.0)
+        delta, Y = (np.where(_known(delta, digits), x, 0.0) for x in (delta, Y))
+        rest = Y - delta * eta[:, None]
         integral = h[:, None, None] * path.mesh.rule.integration * delta[:, None]
         coupling, gamma = delta[:, :, None] * integral, gamma[:, None]
         w, before = np.sign(rest) * np.abs(rest) ** self.alpha, np.full_like(rest, np.inf)

@@ -142,7 +142,7 @@ def known_at(
     ``seen`` are [G | h] and its rounding there, where they are at hand.
     """
     gram, rounding = seen or regression.gram_with_rounding(at)
-    rounding = rounding + regression.rounding_of(gram)
+    rounding = rounding + regression.rounding_of(gram, at)
     elapsed = at - regression.mesh.edges[0]
     return knowledge(gram, regression.terms(at), elapsed, tol, rounding)
 
@@ -153,7 +153,7 @@ def _told(
 ) -> tuple[Array, Array]:
     """How well all are told apart, or λ_min over ρ, and what of that may be rounding, (M,) each."""
     if rho is not None:
-        level = (rounding + regression.rounding_of(matrices)).max(axis=1, initial=_TINY)
+        level = (rounding + regression.rounding_of(matrices, at)).max(axis=1, initial=_TINY)
         return symmetric_eigenvalues(matrices)[:, 0] / rho, level / rho
     known = known_at(regression, at, tol, (matrices, rounding))
     return known.smallest, known.rounding

@@ -231,5 +231,6 @@ def own_sizes(
     sizes, whole = np.sqrt(energy), terms * np.sqrt(np.maximum(elapsed, 0.0))[:, None]
     least = np.maximum(_UNRESOLVED * tol * whole, _TINY)
     level = np.maximum(np.square(least / np.maximum(sizes, least)), _SINGULAR)
-    seen = np.maximum(np.where(sizes > least, sizes, whole), _TINY)
+    seen = np.where(sizes > least, sizes, whole)
+    seen = np.maximum(seen, np.sqrt(np.maximum(rounding, _TINY**2)))
     return seen, np.maximum(level, np.minimum(rounding / energy, 1.0))

@@ -131,7 +131,7 @@ def continuous(
     if settings.noise.seeds > 1 and source.true is not None and observation.parameters:
         with stage("seeds") as pace:
             noise = over_seeds(
-                observation, observe, source.true, source.theta(t[-1:]), estimator, source.levels,
+                observation, observe, source.true, source.theta, estimator, source.levels,
                 pace, known.independent, np.isfinite(estimation.parameters[0, -1]), system,
             )
     unknown = [

@@ -65,13 +65,13 @@ def refuse_seeds(settings: NoiseSettings) -> None:
 
 def over_seeds(
     observation: Observation, observe: Callable[[Signals], Observation], signals: Signals,
-    theta: Array, estimator: Estimator, levels: NoiseLevels, pace: Pace,
+    theta: Callable[[Array], Array], estimator: Estimator, levels: NoiseLevels, pace: Pace,
     columns: IntArray, told: BoolArray, system: DescriptorSystem,
 ) -> NoiseStatistics:
     """Statistics at the horizon over the seeds ``seed``, ``seed + 1``, … of all cases.
 
     The observation is of the noisy signals of ``seed``, ``observe`` makes others, ``signals`` are
-    the true ones, and ``theta`` (1, q) is what the unknowns really are at the horizon. As in the
+    the true ones, and ``theta`` is what the unknowns really are at times (M,), (M, q). As in the
     run, of parameters that others can stand for those of some ``columns`` are estimated, and of
     those that are not ``told`` (p,) nothing is.
     """
@@ -91,7 +91,7 @@ def over_seeds(
     found = list[Array]()
     for own in observed():
         each = _at(horizon, own, estimator, columns, system)
-        truth = _truth(own, horizon, theta, signals)
+        truth = _truth(own, theta, signals)
         found.append(_with_unknowns(each, own.regression, horizon) - truth[:, None])
         done(sum(part.shape[-1] for part in found))
     error, S = np.concatenate(found, axis=-1), observation.regression.parametrisation
@@ -100,7 +100,7 @@ def over_seeds(
         seeds=settings.seeds,
         t=float(horizon[0]),
         names=(*observation.parameters, *(() if S is None else S.names)),
-        truth=_truth(observation, horizon, theta, signals),
+        truth=_truth(observation, theta, signals),
         bias=error.mean(axis=-1),
         deviation=error.std(axis=-1, ddof=1),
         rms=np.sqrt(np.mean(error**2, axis=-1)),
@@ -136,12 +136,15 @@ def _with_unknowns(eta: Array, regression: LinearRegression, horizon: Array) -> 
     return np.asarray(np.moveaxis(whole, 2, 1))
 
 
-def _truth(observation: Observation, horizon: Array, theta: Array, signals: Signals) -> Array:
-    """True η, and true θ where η = S(θ), which are then the states."""
-    truth = np.asarray(observation.truth(horizon, theta, signals.states)[0])
+def _truth(
+    observation: Observation, theta: Callable[[Array], Array], signals: Signals
+) -> Array:
+    """True η at the horizon, after all that θ did, and θ where η = S(θ), which is the states."""
+    t = observation.regression.mesh.edges
+    truth = np.asarray(observation.truth(t, theta(t), signals.states)[-1])
     if observation.regression.parametrisation is None:
         return truth
-    return np.concatenate([truth, signals.states(horizon)[0]])
+    return np.concatenate([truth, signals.states(t[-1:])[0]])
 
 
 def _added(

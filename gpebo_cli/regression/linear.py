@@ -199,16 +199,28 @@ class LinearRegression:
         sizes = np.broadcast_to(self.scale, (self.mesh.size, self.p))
         return np.asarray(sizes[self.mesh.edges[1:-1].searchsorted(t, side="left")])
 
-    def rounding_of(self, gram: Array) -> Array:
-        """What of the diagonal of G (M, p, p + c) filters of moving parameters leave, (M, p).
+    def rounding_of(self, gram: Array, t: Array) -> Array:
+        """What rounding leaves of the diagonal of G (M, p, p + c) at the times t (M,), (M, p).
 
-        They are good to a share of the largest entry, in units in which parameters are comparable.
+        Filters of moving parameters are good to a share of the largest entry, in units in which
+        parameters are comparable; resets make all of G a part of what it was before them.
         """
+        energy = np.einsum("mjj->mj", gram[..., : self.p])
         if self.dynamics is None:
-            return np.zeros(gram.shape[:2])
+            since = np.searchsorted([reset.time for reset in self.resets], t, side="right")
+            return np.where(energy > 0.0, self._carried[since], 0.0)
         squares = self.dynamics.units**2
-        energy = np.einsum("mjj->mj", gram[..., : self.p]) * squares
-        return np.asarray(TOLERANCE * energy.max(axis=1, initial=0.0)[:, None] / squares)
+        largest = (energy * squares).max(axis=1, initial=0.0)
+        return np.asarray(TOLERANCE * largest[:, None] / squares)
+
+    @cached_property
+    def _carried(self) -> Array:
+        """What rounding of what was known before leaves in each segment, (segments, p)."""
+        cuts = self.mesh.edges.searchsorted([reset.time for reset in self.resets])
+        return np.array([np.zeros(self.p), *(
+            reset.rounding(self.gram.values[cut - 1, -1])
+            for cut, reset in zip(cuts, self.resets, strict=True)
+        )])
 
     @cached_property
     def root(self) -> Array:

@@ -36,6 +36,14 @@ class Reset:
         """Whether some of η (p,) go on as they are, as unknowns do."""
         return bool((self.transform[some] == np.eye(len(some))[some]).all())
 
+    def rounding(self, gram: Array) -> Array:
+        """What rounding of a root of G (p, p + c) makes of the diagonal (p,) of that of η₊."""
+        before, units = (np.broadcast_to(u, len(self.shift)) for u in (self.before, self.units))
+        U, sigma, _ = np.linalg.svd(self.transform * before / units[:, None])
+        sigma = np.maximum(sigma, _SINGULAR * sigma[0])
+        error = np.square(_SINGULAR * sigma[0] / sigma[-1]) * (np.diagonal(gram) * before**2).sum()
+        return np.asarray(self.keep * error * np.square(U / sigma).sum(axis=1) / units**2)
+
     def about(self, columns: IntArray) -> Reset:
         """The same for η at ``columns`` (k,), where the others are zero and go on as they are."""
         before, units = (np.broadcast_to(u, len(self.shift)) for u in (self.before, self.units))
@@ -77,8 +85,8 @@ class ExtensionState:
         transform, level = reset.transform * before / units[:, None], self.level * before**2
         symmetric = bool(np.abs(omega - omega.T).max() <= _SYMMETRIC * np.abs(omega).max())
         u, size, vt = np.linalg.svd(0.5 * (omega + omega.T) if symmetric else omega)
-        root = np.sqrt(size)
         known = size > max(_SINGULAR * size[0], np.finfo(float).tiny)
+        root = np.sqrt(np.where(known, size, 0.0))  # of nothing that is not known
         rhs = u.T @ rhs * reciprocals(root, known)  # of L η
         U, sigma, Vt = np.linalg.svd(transform)
         inverse = Vt.T / np.maximum(sigma, _SINGULAR * sigma[0])  # T⁻¹ = inverse Uᵀ

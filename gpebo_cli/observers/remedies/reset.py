@@ -61,9 +61,10 @@ class Resets:
 
     def observe(self, reduced: ReducedSystem) -> Observation:
         """One regression over all segments, with the maps from each to the next."""
-        mesh, times = _with_edges(reduced.mesh, reset_times(reduced, self))
-        cuts = [0, *np.searchsorted(mesh.edges, times).tolist(), mesh.size]
         p = len(reduced.parameters)
+        times = reset_times(reduced, self)[: None if p else 0]  # of nothing nothing starts again
+        mesh, times = _with_edges(reduced.mesh, times)
+        cuts = [0, *np.searchsorted(mesh.edges, times).tolist(), mesh.size]
         begin, xi_a, dual = reduced.begin, reduced.xi_a, reduced.first.split.dual
         later: list[tuple[float, Array, Array]] = []
         extensions: list[Extension] = []
