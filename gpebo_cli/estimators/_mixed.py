@@ -92,7 +92,9 @@ class FilteredEstimator(ResumableEstimator):
     def mixing(self, parameters: Sequence[str]) -> Mixing:
         """The filters at samples, and mixing; one group."""
         filters = self.at_samples(filter_rates(self.rates, parameters))
-        return lambda regression: mix_sampled(filters.update(regression), filters.errors)
+        return lambda regression: mix_sampled(
+            filters.update(regression), filters.errors, regression.scale
+        )
 
     def recursive(self, parameters: Sequence[str], mu: float = 1.0) -> RecursiveMixed:
         """The estimator at samples, for parameters of these names; ``mu`` as of the scalar law."""

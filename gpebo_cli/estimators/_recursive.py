@@ -257,22 +257,30 @@ class KreisselmeierFilter:
         return Filter(decay * np.eye(len(self._rates)), old, new)
 
 
-def mix_sampled(extended: Array, behind: Callable[[], Filter], left: Array | float = 1.0) -> Mixed:
+def mix_sampled(
+    extended: Array, behind: Callable[[], Filter], scale: Array | float, left: Array | float = 1.0
+) -> Mixed:
     """Of one group, from [Ω | 𝒴] (K, p, p + 1), 𝒴 being what filters ``behind`` have, or ``left``.
 
-    That is a matrix (K or 1, p, s) times what they have.
+    That is a matrix (K or 1, p, s) times what they have. Whether Ω is singular is judged beside the
+    ``scale`` (K, p) of the columns of ψ.
     """
-    omega = extended[..., :-1]
+    p = extended.shape[1]
+    units = np.where(np.greater(scale, 0.0), scale, 1.0) * np.ones((len(extended), p))
+    units = np.exp2(-np.rint(np.log2(units)))  # no digit changes
+    omega, size = units[:, :, None] * extended[..., :-1] * units[:, None], units.prod(axis=1)
 
     def solved(rhs: Array) -> tuple[Array, Array, BoolArray]:
         """Δ (K,), Ω⁻¹b (K, p, c), zero where that is rounding, and where it is not (K,)."""
-        delta, action, reciprocal = determinant_and_adjugate_action(omega, rhs)
+        own = units[:, :, None]
+        delta, action, reciprocal = determinant_and_adjugate_action(omega, own * rhs)
         usable = np.asarray((reciprocal > _SINGULAR_FILTER) & (delta != 0.0))
         zero, where = np.zeros_like(action), usable[:, None, None]
-        return delta, np.divide(action, delta[:, None, None], out=zero, where=where), usable
+        found = own * np.divide(action, delta[:, None, None], out=zero, where=where)
+        return delta / size / size, found, usable
 
     def errors() -> tuple[list[Filter], list[Array]]:
-        inverse = solved(np.broadcast_to(np.eye(omega.shape[-1]), omega.shape))[1]
+        inverse = solved(np.broadcast_to(np.eye(p), omega.shape))[1]
         return [behind()], [inverse if isinstance(left, float) else inverse @ left]
 
     delta, quotient, usable = solved(extended[..., -1:])

@@ -427,7 +427,7 @@ def mix(
     p, mesh = extended.values.shape[-2], extended.mesh
     refuse_overflow("Ω, which is made of squares of ψ,", mesh, extended.values)
     units = np.broadcast_to(units, p)[:, None]
-    size = float(np.prod(units**2))
+    size = float(np.prod(units))
     if (units != 1.0).any():
         columns = np.append(units, np.ones(extended.values.shape[-1] - p))
         extended = Trajectory(mesh, extended.values * units * columns)
@@ -435,12 +435,12 @@ def mix(
     def signals(t: Array, inside: Array) -> tuple[Array, Array, Array]:
         values = extended(t, inside)
         delta, Y, digits = determinant_and_adjugate_action(values[..., :p], values[..., p:])
-        return delta / size, (units * Y / size).reshape(len(t), -1), digits
+        return delta / size / size, (units * Y / size / size).reshape(len(t), -1), digits
 
     whole, points = extended.values, extended.values.shape[:2]
     # 𝐘 = adj(Ω) 𝒴 itself is not needed for the quotient: where Δ ≠ 0 it solves Ω η̄ = 𝒴.
     delta, quotient, condition = kernels.laws.mixed(whole.reshape(-1, *whole.shape[2:]), None)
-    delta, quotient = delta / size, units * quotient
+    delta, quotient = delta / size / size, units * quotient
     usable = (delta != 0.0) & (condition * SINGULAR < 1.0)  # False for nan, too
     digits = reciprocals(condition, usable)
     refuse_overflow("Δ² of Δ = det(Ω)", mesh, delta.reshape(points) ** 2)

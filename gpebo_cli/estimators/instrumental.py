@@ -161,7 +161,7 @@ class SampledMeans:
             keep = spans[:-1] * np.eye(2 * p)
             return Filter(*(x / spans[1:] for x in (keep, old * seen[:-1], new * seen[1:])))
 
-        return mix_sampled(left @ means, behind, left)
+        return mix_sampled(left @ means, behind, regression.scale, left)
 
 
 ESTIMATOR = Instrumental
