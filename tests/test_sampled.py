@@ -577,7 +577,7 @@ def test_the_gradient_law_is_solved_exactly_over_each_sample(gain, hold):
 def test_the_new_regressor_is_rotated_over_each_sample(hold):
     """By φ' = κΔ²(π/2 − φ) in all, about −𝐘/Δ as it is there or in the middle."""
     block = regression(K=25, hold=hold)
-    mixed = mix_sampled(KreisselmeierFilter(np.ones(3)).update(block), None)
+    mixed = mix_sampled(KreisselmeierFilter(np.ones(3)).update(block), None, 1.0)
     weight, eta = mixed.delta[:, 0] ** 2, mixed.quotient[:, 0]
     kappa = 1.0 / float(block.steps @ weight)
     made = estimators.build({"name": "exciting", "kappa": kappa, "lambda": 1.0}).recursive("abc")
@@ -658,7 +658,7 @@ def test_what_is_rounding_of_mixing_is_not_used():
         np.column_stack([omega, omega @ [2.0, -1.0]])
         for omega in (np.eye(2), one, 1e-170 * np.eye(2), -np.eye(2))
     ])
-    found = mix_sampled(extended, None)
+    found = mix_sampled(extended, None, 1.0)
     np.testing.assert_array_equal(found.usable[:, 0], [True, False, False, True])
     np.testing.assert_array_equal(
         found.quotient[:, 0], [[2.0, -1.0], [0.0, 0.0], [0.0, 0.0], [2.0, -1.0]]
