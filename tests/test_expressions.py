@@ -148,11 +148,18 @@ def test_long_arrays_are_evaluated_in_parts(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(
     ("text", "side"),
     [("min(t, 0.5)*t", "0.5*t"), ("max(sin(t), t**2)", "sin(t)"), ("min(cos(t), exp(t))", "cos(t)"),
-     ("max(t, max(1 + t**2, 0))", "1 + t**2")],
+     ("max(t, max(1 + t**2, 0))", "1 + t**2"), ("sqrt((t - 1)**2)", "1 - t"),
+     ("sqrt(1 - cos(t)**2)", "sin(t)")],
 )  # fmt: skip
-def test_derivatives_of_min_and_max_are_those_of_their_side(text: str, side: str) -> None:
+def test_derivatives_of_roots_min_and_max_are_those_of_their_side(text: str, side: str) -> None:
     want = derivatives(side, 0.7, 6)
     np.testing.assert_allclose(derivatives(text, 0.7, 6), want, rtol=1e-14, atol=1e-14)
+
+
+def test_roots_of_other_powers_are_no_sizes() -> None:
+    cube = 0.7**1.5, 1.5 * 0.7**0.5, 0.75 * 0.7**-0.5
+    for text, exact in (("sqrt(t**4)", (0.49, 1.4, 2.0)), ("sqrt(t**3)", cube)):
+        np.testing.assert_allclose(derivatives(text, 0.7, 2)[:, 0], exact, rtol=1e-13)
 
 
 @pytest.mark.parametrize("order", [0, 2])

@@ -1400,6 +1400,9 @@ def test_deviations_of_several_files_are_those_of_independent_data(tmp_path):
     assert std[1] == pytest.approx(std[0] / np.sqrt(2.0), rel=1e-3)
     found = run(LEAKY, estimator="least_squares", data=files, time={"samples": 11})
     assert found.to_pandas("estimates")["k_std"].iloc[-1] == pytest.approx(std[1], rel=0.15)
+    for made_up in ({"seeds": 2}, {"quantisation": 0.1}):
+        with refused("noise.seeds and noise.quantisation are for simulations"):
+            run(LEAKY, data=files, noise={**noise, **made_up})
     joined = run(LEAKY, data=[*files, files[0]], time={"samples": 5}).details.recording
     assert (joined.first, joined.last, joined.rows) == (0.0, 24.0, 603)
     with pytest.raises(ConfigError, match="several files"):
