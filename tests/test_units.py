@@ -323,6 +323,23 @@ def test_mixing_keeps_its_digits_in_any_units(name, sampling):
     np.testing.assert_allclose(other, plain, rtol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["gradient", "mre"])
+def test_units_of_unknowns_do_not_decide_whether_gains_are_enough(name):
+    """A gain of its own for each parameter is in its unit, squared."""
+    found = [
+        run({
+            "name": "ramps", "states": ["x", "z"], "outputs": ["y", "w"], "A": [[0, 0], [0, 0]],
+            "unknowns": {"a": 2.0 * k, "b": -1.0 / k}, "E": [[1, 0], [0, 1]],
+            "F": [[1 / k, 0], [0, k]], "C": [[1, 0], [0, 1]], "initial_state": [1, 1],
+        }, estimator=name, time={"horizon": 10, "samples": 3},
+            gamma={"a": 3.0 * k**2, "b": 4.0 / k**2, "e0_x": 10.0, "e0_z": 20.0},
+            ).details.estimation.requirement.evidence["gamma_times_level"]
+        for k in (1.0, 1e-3)
+    ]
+    assert found[0] > 1e-3
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
 @pytest.mark.parametrize("unit", [1e-9, 1e9])
 def test_a_regression_of_functions_and_its_data_have_sizes_in_their_units(unit):
     regression = LinearRegression.from_functions(

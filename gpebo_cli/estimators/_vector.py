@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -127,8 +127,14 @@ class VectorEstimates(Lasting):
         """Persistent excitation by the information of all ``parts`` of a span, or what is told."""
         if self.told is not None:
             return super().over(parts, span)
-        each = (part.information for part in parts if isinstance(part, VectorEstimates))
-        return persistent(self.information, float(self.gains.min()), each, span)
+        least = self.gains.min(axis=0)
+        gain = float(least.min())
+        root = np.sqrt(least / gain)[:, None]  # in such units of the parameters gains are alike
+        each = (
+            replace(part.information, values=part.information.values * root * root.T)
+            for part in parts if isinstance(part, VectorEstimates)
+        )
+        return persistent(self.information, gain, each, span)
 
     def delta(self, t: Array) -> Array | None:
         """Δ at the times t (M,), shape (1, M); None where nothing is mixed."""
