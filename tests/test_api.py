@@ -121,14 +121,14 @@ def test_what_is_done_to_the_plant_of_a_result_is_not_in_the_next_run():
     assert second.details.system.units["e1"] == "V"
 
 
-def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed():
+@pytest.mark.parametrize("sampling", [{}, {"sample_time": 0.1}])
+def test_a_name_that_is_parameter_and_state_is_refused_rather_than_guessed(sampling):
     plant = {
         "name": "clash", "states": ["T", "e0_T"], "outputs": ["y"], "E": [[1, 0], [0, 0]],
         "A": [[-1, 0], [1, 1]], "C": [[1, 0]], "initial_state": [1, -1],
     }
-    result = run(plant, time={"samples": 11})
-    with pytest.raises(KeyError, match="both a parameter and a state"):
-        _ = result.estimates["e0_T"]
+    with refused("plant clash: e0_T is an estimated parameter and a state; every name must be"):
+        run(plant, time={"samples": 11}, observer={"name": "gpebo", **sampling})
 
 
 @pytest.mark.parametrize(("time", "solver", "message"), [

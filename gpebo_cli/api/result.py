@@ -48,11 +48,8 @@ class NamedArrays(Mapping[str, Array]):
     def __init__(self, what: str, names: Sequence[str], values: Array) -> None:
         self._what = what
         self._values: dict[str, Array] = dict(zip(names, np.moveaxis(values, -1, 0), strict=True))
-        self._twice = {name for name in names if list(names).count(name) > 1}
 
     def __getitem__(self, name: str) -> Array:
-        if name in self._twice:
-            raise UnknownNameError(f"{name} is both a parameter and a state; rename the state")
         if name not in self._values:
             what = f"{self._what} has no {shown(name)}"
             raise UnknownNameError(str(unknown(what, name, self._values)))

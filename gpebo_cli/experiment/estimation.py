@@ -41,7 +41,7 @@ from gpebo_cli.experiment.uncertainty import (
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.findings import replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.model.plant import kind_of_name
+from gpebo_cli.model.plant import told_apart
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
 from gpebo_cli.observers._base import Differentiable, Filtering
 from gpebo_cli.settings import Settings
@@ -91,10 +91,7 @@ def continuous(
             if source.pieces else observe(source)
         )
         regression = observation.regression
-        kind_of_name(f"plant {system.name}", {  # several files have e0_x_2, and filters w_x
-            "an estimated parameter": observation.parameters, "a state": system.states,
-            "an unknown": (),
-        })
+        told_apart(observation.parameters, system)
         sampler = regression.mesh.sampler(t)
         sampled = RegressionResult(
             t, sampler(regression.Y.values), sampler(regression.psi.values),

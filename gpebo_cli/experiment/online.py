@@ -21,6 +21,7 @@ from gpebo_cli.experiment.result import Fit
 from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
+from gpebo_cli.model.plant import told_apart
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
 from gpebo_cli.recordings.hold import Hold
@@ -106,7 +107,7 @@ class Online:
             "observer.sample_time and streams need an observer that runs at samples",
         ).at_samples(system, settings.solver, hold, start, sample, derivatives)
         self.cases: tuple[Mapping[str, float], ...] = estimator.cases
-        self.parameters = self._observer.parameters
+        self.parameters = told_apart(self._observer.parameters, system)
         self._columns = np.arange(len(self.parameters)) if columns is None else columns
         own = tuple(self.parameters[j] for j in self._columns)
         self._recursion = estimators.at_samples(estimator, own)
