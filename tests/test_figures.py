@@ -433,6 +433,14 @@ def test_names_and_numbers_are_written_as_people_write_them() -> None:
     assert symbols.with_unit("load", "N*m") == "load (N·m)"
 
 
+def test_what_stands_for_a_state_has_its_unit():
+    """In a second file, too, and as w; an unknown k_2 is no second k."""
+    units = {"x": "m", "x_2": "s", "k": "A"}
+    names = "x", "e0_x", "e0_x_3", "e0_x_2", "w_x", "k", "k_2", "e0_1", "w"
+    found = [symbols.unit_of(name, units) for name in names]
+    assert found == ["m", "m", "m", "s", "m", "A", "", "", ""]
+
+
 @pytest.mark.parametrize("unit", [1.0, 1e-20])
 def test_a_logarithmic_axis_has_the_size_of_what_is_drawn_in_it(unit: float) -> None:
     result = make_result(samples=11)

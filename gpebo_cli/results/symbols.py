@@ -25,8 +25,13 @@ def with_unit(name: str, unit: str, between: str = " ") -> str:
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Unit of a quantity, empty if unknown: ``e0_<state>`` has that of the state."""
-    return units.get(name) or units.get(name.removeprefix("e0_"), "")
+    """Unit of a quantity, empty if unknown: ``e0_<state>`` and ``w_<state>`` have the state's.
+
+    So has ``e0_<state>_2``, of a second file.
+    """
+    of_state = re.fullmatch(r"(?:e0|w)_(.+?)(_\d+)?", name)
+    state, number = of_state.groups("") if of_state else (name, "")
+    return units.get(name) or units.get(state + number) or units.get(state, "")
 
 
 def power_of_ten(exponent: int) -> str:
