@@ -25,11 +25,11 @@ def with_unit(name: str, unit: str, between: str = " ") -> str:
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """Unit of a quantity, empty if unknown: ``e0_<state>`` and ``w_<state>`` have the state's.
+    """Unit of a quantity, empty if unknown: ``e0_<state>`` has that of the state.
 
     So has ``e0_<state>_2``, of a second file.
     """
-    of_state = re.fullmatch(r"(?:e0|w)_(.+?)(_\d+)?", name)
+    of_state = re.fullmatch(r"e0_(.+?)(_\d+)?", name)
     state, number = of_state.groups("") if of_state else (name, "")
     return units.get(name) or units.get(state + number) or units.get(state, "")
 
