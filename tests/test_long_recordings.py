@@ -19,7 +19,7 @@ from gpebo_cli.experiment.fit import _follows, _step, _varies_slowly
 from gpebo_cli.findings import Requirement
 from gpebo_cli.model.plant import plant_from_mapping
 from gpebo_cli.numerics import mesh
-from gpebo_cli.numerics.mesh import Trajectory
+from gpebo_cli.numerics.mesh import Mesh, Trajectory
 from gpebo_cli.numerics.radau import radau_rule
 from gpebo_cli.numerics.rows import Rows
 from gpebo_cli.observers import Measurements, build, gpebo
@@ -216,6 +216,18 @@ def test_windows_together_have_the_largest_errors_and_sizes_of_each():
     assert found.moving.tolist() == [[2.5, 1.0], [0.0, 2.0]]
     for values in (whole.trajectory.values, found.Y, found.psi, found.offset, found.gain):
         assert values.reshape(3, -1).min(axis=1).tolist() == [1.0, 2.0, 0.5]
+
+
+@pytest.mark.parametrize("size", [3, 4, 8, 9, 11])
+def test_times_are_shared_out_to_the_windows_they_are_in(size, monkeypatch):
+    """Of four elements of one second each, the last one of what is left; from t = 5."""
+    monkeypatch.setattr(mesh, "_WINDOW", 4)
+    whole = Mesh(np.arange(size + 1.0), radau_rule(3), 5.0)
+    t = 5.25 + 0.5 * np.arange(2 * size)
+    shares = list(whole.shares(t))
+    assert [len(share) for share in shares] == [2 * window.size for window in whole.windows()]
+    for share, window in zip(shares, whole.windows(), strict=True):
+        assert window.span[0] < share[0] <= share[-1] < window.span[1]
 
 
 @pytest.mark.parametrize(("observer", "estimator"), [

@@ -760,6 +760,8 @@ def test_resets_that_do_not_say_what_errors_do_have_no_deviations(monkeypatch):
     ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1}},
      "each of 33 cases would take a pass of its own"),
     ("descriptor", {"observer": {"sample_time": 0.1}, "time": {"horizon": 2.0}}, ""),
+    ("descriptor", {"gamma": "logspace(0,2,33)", "observer": {"sample_time": 0.1},
+                    "uncertainty": False}, ""),
     ("boost", {}, "noise of the signals is in the matrices"), ("boost", {"noise": "none"}, ""),
     ("circuit", {"estimator": "gradient", "gamma": 1e20}, "the gain is so large"),
 ])
