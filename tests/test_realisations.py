@@ -61,10 +61,11 @@ def settings(system, estimator, horizon=4.0, weights=None, **noise):
 # The axis of realisations ------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("size", [0.1, 0.0])  # of what is exact there is a closed form
 @pytest.mark.parametrize("settings", ESTIMATORS, ids=lambda s: "-".join(map(str, s.values())))
-def test_estimators_carry_realisations_through(settings):
+def test_estimators_carry_realisations_through(settings, size):
     def disturbance(k):
-        return lambda t: 0.1 * np.sin((2 + k) * t + k)
+        return lambda t: size * np.sin((2 + k) * t + k)
 
     single = [regression(three, ETA, 6.0, 40, disturbance(k)) for k in range(3)]
     together = replace(
