@@ -28,7 +28,12 @@ from gpebo_cli.experiment.fit import fit_of
 from gpebo_cli.experiment.limits import Pace, check_at_samples
 from gpebo_cli.experiment.noise import signal_noise
 from gpebo_cli.experiment.online import Online, OnlineEstimates, joined
-from gpebo_cli.experiment.result import EstimationResult, RegressionResult, RunResult
+from gpebo_cli.experiment.result import (
+    EstimationResult,
+    RegressionResult,
+    RunResult,
+    told_apart,
+)
 from gpebo_cli.experiment.seeds import over_seeds, refuse_seeds
 from gpebo_cli.experiment.several import joined_observation
 from gpebo_cli.experiment.sources import Source, kept_samples, sample_times
@@ -41,7 +46,6 @@ from gpebo_cli.experiment.uncertainty import (
 from gpebo_cli.experiment.verdict import functions_note, simulation_note, verdict
 from gpebo_cli.findings import replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.model.plant import told_apart
 from gpebo_cli.observers import Measurements, Observation, Observer, Sampling
 from gpebo_cli.observers._base import Differentiable, Filtering
 from gpebo_cli.settings import Settings

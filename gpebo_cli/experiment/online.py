@@ -17,11 +17,10 @@ from gpebo_cli.evidence.excitation import WELL, Excitation
 from gpebo_cli.evidence.knowledge import Knowledge, knowledge_of_roots
 from gpebo_cli.evidence.sampled_uncertainty import SampledDeviations
 from gpebo_cli.experiment import doubts as doubted
-from gpebo_cli.experiment.result import Fit
+from gpebo_cli.experiment.result import Fit, told_apart
 from gpebo_cli.experiment.uncertainty import MOST_CASES
 from gpebo_cli.findings import Assumption, Requirement
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem, IntArray
-from gpebo_cli.model.plant import told_apart
 from gpebo_cli.numerics.linalg import transpose
 from gpebo_cli.observers.reduced.sampled import TOLERANCE
 from gpebo_cli.recordings.hold import Hold

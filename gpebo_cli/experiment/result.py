@@ -17,6 +17,7 @@ from gpebo_cli.evidence.excitation import Excitation
 from gpebo_cli.evidence.metrics import Metrics
 from gpebo_cli.findings import Assumption, OnDemand, Requirement, evaluated, replaced
 from gpebo_cli.model.descriptor import Array, BoolArray, DescriptorSystem
+from gpebo_cli.model.plant import kind_of_name
 from gpebo_cli.schema import instant
 from gpebo_cli.settings import Settings
 
@@ -106,6 +107,16 @@ class RegressionResult:
     psi: Array  # (N, rows, p)
     parameters: tuple[str, ...]  # p names: the plant's unknowns, then e0_<state>
     error_estimate: float
+
+
+def told_apart(parameters: tuple[str, ...], system: DescriptorSystem) -> tuple[str, ...]:
+    """The parameters, if no two of them, and no state, have the same name (ConfigError).
+
+    Tables go by name. Several files have e0_x_2 of x, and of a state x_2; filters have w_x of x.
+    """
+    kinds = {"an estimated parameter": parameters, "a state": system.states, "an unknown": ()}
+    kind_of_name(f"plant {system.name}", kinds)
+    return parameters
 
 
 @dataclass(frozen=True)

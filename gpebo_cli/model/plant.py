@@ -262,16 +262,6 @@ def kind_of_name(plant: str, kinds: Mapping[str, Collection[str]]) -> dict[str, 
     return seen
 
 
-def told_apart(parameters: tuple[str, ...], system: DescriptorSystem) -> tuple[str, ...]:
-    """The parameters, if no two of them, and no state, have the same name (ConfigError).
-
-    Several files have e0_x_2 of x, and of a state x_2; filters estimate w_x of x.
-    """
-    kinds = {"an estimated parameter": parameters, "a state": system.states, "an unknown": ()}
-    kind_of_name(f"plant {system.name}", kinds)
-    return parameters
-
-
 def read_parameters(
     plant: str, value: object, signals: Mapping[str, Expression], elsewhere: Mapping[str, str]
 ) -> dict[str, Expression]:
